@@ -1,0 +1,55 @@
+"""The nouns of the house: what flows from a recording to a rendered picture."""
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import (
+    CaptureError,
+    MissingExtra,
+    OptionError,
+    RunError,
+    ShapeError,
+    SharpfieldError,
+)
+from sharpfield.core.events import EventStream, SiteColour
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import Frames
+from sharpfield.core.measurements import Batch, EventPairs, Pixels
+from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Field, Formation, Model, Recipe, Renderer, Trajectory
+from sharpfield.core.radiance import Emission, Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, Schedule
+from sharpfield.core.struct import Struct
+
+__all__ = [
+    "Batch",
+    "Camera",
+    "Capture",
+    "CaptureError",
+    "Clock",
+    "Emission",
+    "EventPairs",
+    "EventStream",
+    "Exposure",
+    "Field",
+    "Formation",
+    "Frames",
+    "Group",
+    "MissingExtra",
+    "Model",
+    "OptionError",
+    "Paper",
+    "Pixels",
+    "Radiance",
+    "Rays",
+    "Recipe",
+    "Renderer",
+    "RunError",
+    "Schedule",
+    "ShapeError",
+    "SharpfieldError",
+    "SiteColour",
+    "Split",
+    "Struct",
+    "Trajectory",
+]

@@ -1,0 +1,172 @@
+"""A capture: everything recorded of one scene, on one clock, in one space."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64, Shaped
+from torch import Tensor
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Frames
+from sharpfield.core.protocols import Trajectory
+
+HELD_BACK_US = 2
+"""Rounding of times in published files; poses may end this much before an exposure does."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Converts us on disk to the 0...1 that rays carry, once.
+
+    float32 counts whole us only up to 16.8 s, but as a fraction of a capture it is good to 3.6 us
+    over a minute, which is fine for poses. Differences of event times are taken in int64.
+    """
+
+    origin_us: int
+    span_us: int
+
+    def unit(self, t_us: Int64[np.ndarray, "*n"] | int) -> Float[np.ndarray, "*n"]:
+        """Fraction of the capture, float64."""
+        return (np.asarray(t_us, np.int64) - self.origin_us) / self.span_us
+
+    def us(self, unit: Float[np.ndarray, "*n"] | float) -> Int64[np.ndarray, "*n"]:
+        """Back to us, rounded."""
+        return np.rint(np.asarray(unit) * self.span_us).astype(np.int64) + self.origin_us
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which frames are learned from and which are held out, by index."""
+
+    train: Int64[np.ndarray, "a"]
+    test: Int64[np.ndarray, "b"]
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Frames, events, or both, with the camera and its trajectory."""
+
+    camera: Camera
+    trajectory: Trajectory
+    clock: Clock
+    near: float
+    """Nearest depth of the scene along a camera's axis, in world units."""
+    far: float
+    frames: Frames | None = None
+    events: EventStream | None = None
+    split: Split = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    points: Float[np.ndarray, "m 3"] | None = None
+    """Sparse scene points, where a reconstruction came with the capture."""
+    name: str = "capture"
+    source: str = ""
+    """The layout it was read from."""
+    notes: dict[str, Shaped[np.ndarray, "..."] | float | str] = field(default_factory=dict)
+    """What the source says besides: thresholds of a simulation, rounding of times, ..."""
+
+    def __post_init__(self) -> None:
+        if self.frames is None and self.events is None:
+            raise CaptureError("a capture needs frames or events, and has neither", where=self.name)
+        if not 0 < self.near < self.far:
+            raise CaptureError(
+                "depth bounds must satisfy 0 < near < far",
+                where=self.name,
+                got=f"near {self.near}, far {self.far}",
+                do="check the last two columns of the poses, or `near` and `far`",
+            )
+        if self.frames is not None:
+            self._frames_agree(self.frames)
+            self._poses_cover(self.frames)
+
+    @cached_property
+    def frame_time(self) -> Float[Tensor, "n 2"]:
+        """Opening and closing time of each frame as the unit times that rays carry."""
+        frames = self.needed_frames
+        times = [frames.exposure.open_us, frames.exposure.close_us]
+        return torch.from_numpy(np.stack([self.clock.unit(t) for t in times], -1)).float()
+
+    @property
+    def needed_frames(self) -> Frames:
+        """The frames.
+
+        Raises:
+            CaptureError: There are none.
+        """
+        if self.frames is None:
+            raise CaptureError("this needs frames, and the capture has none", where=self.name)
+        return self.frames
+
+    @property
+    def needed_events(self) -> EventStream:
+        """The events.
+
+        Raises:
+            CaptureError: There are none.
+        """
+        if self.events is None:
+            raise CaptureError("this needs events, and the capture has none", where=self.name)
+        return self.events
+
+    def frame_pose(self, frames: Int64[np.ndarray, "m"]) -> Float[Tensor, "m 3 4"]:
+        """World-from-camera poses in the middle of the exposures of some frames."""
+        held = self.needed_frames
+        time = torch.from_numpy(self.clock.unit(held.exposure.middle_us[frames])).float()
+        return self.trajectory.pose(time, torch.from_numpy(held.track[frames]))
+
+    def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
+        """The same capture with frames or events taken away."""
+        return replace(
+            self,
+            frames=None if frames else self.frames,
+            events=None if events else self.events,
+        )
+
+    def _frames_agree(self, frames: Frames) -> None:
+        if (frames.width, frames.height) != self.camera.size:
+            raise CaptureError(
+                "images and camera have different sizes",
+                where=self.name,
+                got=f"images {frames.width}x{frames.height},"
+                f" camera {self.camera.width}x{self.camera.height}",
+                do="give the intrinsics for the images' own size",
+            )
+        used = np.concatenate([self.split.train, self.split.test])
+        if len(used) and (used.min() < 0 or used.max() >= len(frames)):
+            raise CaptureError(
+                "the split names frames that do not exist",
+                where=self.name,
+                got=f"indices {used.min()} to {used.max()} of {len(frames)} frames",
+            )
+
+    def _poses_cover(self, frames: Frames) -> None:
+        for track in np.unique(frames.track):
+            known = self.trajectory.known_us(int(track))
+            if known is None:
+                continue
+            member = np.flatnonzero(frames.track == track)
+            opens, closes = frames.exposure.open_us[member], frames.exposure.close_us[member]
+            wrong = member[(opens < known[0] - HELD_BACK_US) | (closes > known[1] + HELD_BACK_US)]
+            if len(wrong):
+                i = int(wrong[0])
+                raise CaptureError(
+                    f"poses do not cover {len(wrong)} of {len(member)} exposures",
+                    where=f"{self.name}, frame {frames.names[i]} (track {track})",
+                    got=f"poses from {known[0]} to {known[1]} us, exposure from"
+                    f" {frames.exposure.open_us[i]} to {frames.exposure.close_us[i]} us",
+                    do=_unit_hint(frames, known)
+                    or "give poses for the whole exposure, or leave these frames out",
+                )
+
+
+def _unit_hint(frames: Frames, known: tuple[int, int]) -> str:
+    """A factor of 1000 between two clocks is nearly always a unit."""
+    last_frame, last_pose = int(frames.exposure.close_us.max()), max(abs(known[1]), 1)
+    ratio = max(last_frame, 1) / last_pose
+    if 300 < ratio < 3000:
+        return "exposure times look like ns where us were expected: divide them by 1000"
+    if 300 < 1 / ratio < 3000:
+        return "pose times look like ns where us were expected: divide them by 1000"
+    return ""

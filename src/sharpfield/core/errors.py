@@ -1,0 +1,52 @@
+"""One error tree. A message says what is wrong, where, what was found, and what to do about it.
+
+Everything that comes from outside (files, the command line, a user's arrays) fails with one of
+these; the command line prints the message alone and exits with code 2. Truths internal to the
+program are plain assertions.
+"""
+
+
+class SharpfieldError(Exception):
+    """Something outside the program is wrong, and the user can mend it.
+
+    Args:
+        what: One sentence: what is wrong.
+        where: The file, dataset, frame or option that is meant.
+        got: The value that was found there.
+        do: What the user can do about it.
+    """
+
+    def __init__(self, what: str, *, where: object = "", got: object = "", do: str = "") -> None:
+        self.what, self.where, self.got, self.do = what, str(where), str(got), do
+        lines = [f"{type(self).__name__}: {what}"]
+        lines += [f"  {key:5}  {text}" for key, text in self._details() if text]
+        super().__init__("\n".join(lines))
+
+    def _details(self) -> list[tuple[str, str]]:
+        return [("where", self.where), ("got", self.got), ("do", self.do)]
+
+
+class CaptureError(SharpfieldError):
+    """A capture on disk cannot be read, or contradicts itself."""
+
+
+class ShapeError(SharpfieldError):
+    """An array has the wrong shape or type."""
+
+
+class RunError(SharpfieldError):
+    """A run folder or one of its checkpoints cannot be used."""
+
+
+class OptionError(SharpfieldError):
+    """An option, or a combination of options, makes no sense."""
+
+
+class MissingExtra(SharpfieldError):
+    """An optional package is needed and not installed."""
+
+    def __init__(self, package: str, *, extra: str, purpose: str) -> None:
+        super().__init__(
+            f"{purpose} needs the package {package!r}",
+            do=f"pip install 'sharpfield[{extra}]'",
+        )

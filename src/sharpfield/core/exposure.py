@@ -1,0 +1,49 @@
+"""When the shutter was open."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from sharpfield.core.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Opening and closing time of the shutter for each frame, in us on the capture's clock.
+
+    A frame with `open_us == close_us` is an instant: a sharp picture, as far as motion goes.
+    """
+
+    open_us: Int64[np.ndarray, "n"]
+    close_us: Int64[np.ndarray, "n"]
+
+    def __post_init__(self) -> None:
+        wrong = np.flatnonzero(self.close_us < self.open_us)
+        if len(wrong):
+            i = wrong[0]
+            raise CaptureError(
+                "an exposure ends before it begins",
+                where=f"frame {i}",
+                got=f"opens at {self.open_us[i]} us, closes at {self.close_us[i]} us",
+                do="check the order of the two columns of exposure times",
+            )
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.open_us)
+
+    @property
+    def middle_us(self) -> Int64[np.ndarray, "n"]:
+        """Middle of each exposure."""
+        return self.open_us + (self.close_us - self.open_us) // 2
+
+    @property
+    def duration_us(self) -> Int64[np.ndarray, "n"]:
+        """How long each shutter was open."""
+        return self.close_us - self.open_us
+
+    @property
+    def instant(self) -> Bool[np.ndarray, "n"]:
+        """Whether a frame was taken at one instant, free of motion blur by construction."""
+        return self.open_us == self.close_us

@@ -1,0 +1,62 @@
+"""What one training step looks at: pixels of frames, pairs of events. All tensors, on the device."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from sharpfield.core.struct import Struct
+
+
+@dataclass(frozen=True)
+class Pixels(Struct):
+    """Pixels of frames, with what the camera reported there."""
+
+    trailing: ClassVar = {"xy": 1, "value": 1}
+
+    xy: Float[Tensor, "*b 2"]
+    """Centres, in pixels."""
+    frame: Int64[Tensor, "*b"]
+    """Index of the frame in the capture."""
+    track: Int64[Tensor, "*b"]
+    open: Float[Tensor, "*b"]
+    """When the shutter opened, 0...1 of the capture."""
+    close: Float[Tensor, "*b"]
+    value: Float[Tensor, "*b c"]
+    """As stored, 0...1: display-referred unless the frames are linear."""
+
+    @property
+    def middle(self) -> Float[Tensor, "*b"]:
+        """Middle of the exposure."""
+        return (self.open + self.close) / 2
+
+
+@dataclass(frozen=True)
+class EventPairs(Struct):
+    """Two instants of the same pixel, and the events counted after the first up to the second."""
+
+    trailing: ClassVar = {"xy": 1}
+
+    xy: Float[Tensor, "*b 2"]
+    """Where the pixel looks, in pixels (centres at +0.5)."""
+    track: Int64[Tensor, "*b"]
+    start: Float[Tensor, "*b"]
+    """First instant, 0...1 of the capture."""
+    end: Float[Tensor, "*b"]
+    negative: Float[Tensor, "*b"]
+    """Minus the number of events to darker: 0, -1, ..."""
+    positive: Float[Tensor, "*b"]
+    """Number of events to brighter."""
+    channel: Int64[Tensor, "*b"] | None = None
+    """Colour filter of the pixel: 0 red, 1 green, 2 blue. None on a mono sensor."""
+
+    def measured(
+        self, threshold_negative: Tensor | float, threshold_positive: Tensor | float
+    ) -> Float[Tensor, "*b"]:
+        """Change of log intensity that the events report, given the contrast thresholds."""
+        return self.negative * threshold_negative + self.positive * threshold_positive
+
+
+Batch = dict[str, Pixels | EventPairs]
+"""What a recipe draws for a step, by name."""

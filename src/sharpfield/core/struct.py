@@ -1,0 +1,91 @@
+"""Frozen structs of tensors that share their leading axes.
+
+A struct is a frozen dataclass whose tensor fields agree on their leading axes and may have
+trailing axes of their own (a direction has 3). `trailing` says how many, so that a struct can be
+moved, indexed, reshaped and concatenated as one thing. This is the only inheritance in the
+project besides `nn.Module`, `Protocol` and `Exception`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+S = TypeVar("S", bound="Struct")
+"""Not `Self`: beartype checks methods one by one and cannot resolve it there."""
+
+
+class Struct:
+    """Tensors with common leading axes; subclasses are frozen dataclasses."""
+
+    trailing: ClassVar[dict[str, int]] = {}
+    """Trailing axes of each field that has any; fields not named here have none."""
+
+    def map(self: S, change: Callable[[Tensor, int], Tensor]) -> S:
+        """Apply `change(tensor, trailing axes)` to every tensor, also inside nested structs."""
+        changed: dict[str, Any] = {}
+        for name, value in self._fields():
+            if isinstance(value, Tensor):
+                changed[name] = change(value, self.trailing.get(name, 0))
+            elif isinstance(value, Struct):
+                changed[name] = value.map(change)
+        return dataclasses.replace(self, **changed)  # pyright: ignore[reportArgumentType]
+
+    def to(self: S, device: torch.device | str) -> S:
+        """The same struct on another device."""
+        return self.map(lambda tensor, _: tensor.to(device))
+
+    def __getitem__(self: S, index: Any) -> S:
+        """Index the leading axes; every field keeps its trailing axes whole."""
+        index = index if isinstance(index, tuple) else (index,)
+        return self.map(
+            lambda tensor, trailing: (
+                tensor[(*index, *([slice(None)] * trailing))]
+                if Ellipsis in [i for i in index if not isinstance(i, Tensor)]
+                else tensor[index]
+            )
+        )
+
+    def reshape(self: S, *shape: int) -> S:
+        """Give the leading axes another shape."""
+        return self.map(
+            lambda tensor, trailing: tensor.reshape(*shape, *tensor.shape[tensor.ndim - trailing :])
+        )
+
+    @property
+    def shape(self) -> torch.Size:
+        """The leading axes."""
+        for name, value in self._fields():
+            if isinstance(value, Tensor):
+                return value.shape[: value.ndim - self.trailing.get(name, 0)]
+        raise AssertionError(f"{type(self).__name__} holds no tensor")
+
+    @property
+    def device(self) -> torch.device:
+        """Where the tensors are."""
+        for _, value in self._fields():
+            if isinstance(value, Tensor):
+                return value.device
+        raise AssertionError(f"{type(self).__name__} holds no tensor")
+
+    def __len__(self) -> int:
+        """Size of the first leading axis."""
+        return self.shape[0]
+
+    @classmethod
+    def cat(cls: type[S], items: Sequence[S]) -> S:
+        """Join structs along the first leading axis. A field is None in all of them or in none."""
+        joined: dict[str, Any] = {}
+        for field in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
+            values = [getattr(item, field.name) for item in items]
+            if isinstance(values[0], Tensor):
+                joined[field.name] = torch.cat(values)
+            elif isinstance(values[0], Struct):
+                joined[field.name] = type(values[0]).cat(values)
+        return dataclasses.replace(items[0], **joined)  # pyright: ignore[reportArgumentType]
+
+    def _fields(self) -> list[tuple[str, Any]]:
+        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
+        return [(field.name, getattr(self, field.name)) for field in fields]
