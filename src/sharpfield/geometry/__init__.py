@@ -1,0 +1,30 @@
+"""Pure functions of poses and space."""
+
+from sharpfield.geometry.cast import cast
+from sharpfield.geometry.space import Frustum, Metric, Similarity, Space, ndc, normalisation
+from sharpfield.geometry.trajectory import (
+    BSpline,
+    LearnedKnots,
+    Moved,
+    Stamped,
+    Still,
+    Tracks,
+    check_poses,
+)
+
+__all__ = [
+    "BSpline",
+    "Frustum",
+    "LearnedKnots",
+    "Metric",
+    "Moved",
+    "Similarity",
+    "Space",
+    "Stamped",
+    "Still",
+    "Tracks",
+    "cast",
+    "check_poses",
+    "ndc",
+    "normalisation",
+]
