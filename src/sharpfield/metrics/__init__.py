@@ -1,0 +1,24 @@
+"""Numbers to report, never to train on."""
+
+from sharpfield.metrics.events import count_error, relative_count_error
+from sharpfield.metrics.image import psnr, ssim, ssim_paper, ssim_uniform
+from sharpfield.metrics.lpips import Lpips, load_lpips
+from sharpfield.metrics.pose import absolute_error, align, relative_error
+from sharpfield.metrics.sharpness import gradient_energy, laplacian_variance, luma
+
+__all__ = [
+    "Lpips",
+    "absolute_error",
+    "align",
+    "count_error",
+    "gradient_energy",
+    "laplacian_variance",
+    "load_lpips",
+    "luma",
+    "psnr",
+    "relative_count_error",
+    "relative_error",
+    "ssim",
+    "ssim_paper",
+    "ssim_uniform",
+]

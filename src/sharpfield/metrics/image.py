@@ -1,0 +1,103 @@
+"""How alike two pictures are: PSNR, and SSIM in the definitions that papers print.
+
+All functions take pictures `[h w c]` with values 0...1 in the display domain (as files store
+them), compare them channel by channel, and compute in float64. SSIM comes in three settings that
+give *different numbers for the same pictures*, so a table has to say which one it shows:
+
+- `ssim`: the definition of Wang et al. 2004: a Gaussian window of 11x11 with sigma 1.5,
+  population covariance, data range 1.
+- `ssim_uniform`: scikit-image's default: a uniform window of 7x7, sample covariance, range 1.
+- `ssim_paper`: the numbers printed by NeRF deblurring papers (Deblur-NeRF, DP-NeRF, PDRF,
+  Ev-DeblurNeRF): as `ssim_uniform`, but of pictures mapped to -1...1 with range 2. Local means then
+  lie around zero, and its luminance term punishes grey regions; it is often much lower.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.errors import ShapeError
+
+Picture = Float[Tensor, "h w c"]
+
+K1, K2 = 0.01, 0.03
+GAUSSIAN_WINDOW, GAUSSIAN_SIGMA = 11, 1.5
+UNIFORM_WINDOW = 7
+
+
+def psnr(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
+    _same_shape(predicted, truth)
+    return -10 * (predicted.double() - truth.double()).square().mean().log10()
+
+
+def ssim(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+    """Structural similarity with a Gaussian window, as defined by its authors.
+
+    Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to
+    structural similarity", IEEE TIP 2004. Windows lie wholly inside the picture.
+    """
+    offset = torch.arange(GAUSSIAN_WINDOW, dtype=torch.float64) - GAUSSIAN_WINDOW // 2
+    window = (-0.5 * (offset / GAUSSIAN_SIGMA).square()).exp()
+    return _ssim(predicted, truth, window / window.sum(), unbiased=1.0, data_range=1.0)
+
+
+def ssim_uniform(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+    """Structural similarity with scikit-image's default window, on 0...1."""
+    return _ssim(predicted, truth, *_uniform(), data_range=1.0)
+
+
+def ssim_paper(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+    """Structural similarity as the papers on deblurring radiance fields print it."""
+    return _ssim(predicted * 2 - 1, truth * 2 - 1, *_uniform(), data_range=2.0)
+
+
+def _uniform() -> tuple[Float[Tensor, "t"], float]:
+    """The window, and the factor from population to sample covariance."""
+    count = UNIFORM_WINDOW**2
+    window = torch.full((UNIFORM_WINDOW,), 1 / UNIFORM_WINDOW, dtype=torch.float64)
+    return window, count / (count - 1)
+
+
+def _ssim(
+    predicted: Picture,
+    truth: Picture,
+    window: Float[Tensor, "t"],
+    unbiased: float,
+    *,
+    data_range: float,
+) -> Float[Tensor, ""]:
+    """SSIM for any separable window; the border where it does not fit is left out."""
+    _same_shape(predicted, truth)
+    if min(truth.shape[:2]) < len(window):
+        raise ShapeError(
+            "picture is smaller than the window of SSIM",
+            got=f"{truth.shape[1]}x{truth.shape[0]} pixels, window {len(window)}",
+            do="evaluate at a larger size",
+        )
+    x, y = predicted.double(), truth.double()
+    window = window.to(x)
+    mean_x, mean_y = _blur(x, window), _blur(y, window)
+    variance_x = unbiased * (_blur(x * x, window) - mean_x * mean_x)
+    variance_y = unbiased * (_blur(y * y, window) - mean_y * mean_y)
+    covariance = unbiased * (_blur(x * y, window) - mean_x * mean_y)
+    c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
+    return (luminance * structure).mean()
+
+
+def _blur(picture: Picture, window: Float[Tensor, "t"]) -> Float[Tensor, "y x c"]:
+    """Separable weighted mean over windows that fit inside."""
+    layers = picture.permute(2, 0, 1)[:, None]  # [c, 1, h, w]
+    layers = torch.nn.functional.conv2d(layers, window[None, None, :, None])
+    layers = torch.nn.functional.conv2d(layers, window[None, None, None, :])
+    return layers[:, 0].permute(1, 2, 0)
+
+
+def _same_shape(predicted: Picture, truth: Picture) -> None:
+    if predicted.shape != truth.shape:
+        raise ShapeError(
+            "pictures to compare have different shapes",
+            got=f"{tuple(predicted.shape)} and {tuple(truth.shape)}",
+        )
