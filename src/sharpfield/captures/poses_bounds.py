@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Shaped
 
 from sharpfield.core.errors import CaptureError
-
-ORTHONORMAL = 1e-4
-"""How far R^T R may be from the identity."""
+from sharpfield.geometry.trajectory import check_poses
 
 
 @dataclass(frozen=True)
@@ -50,15 +48,10 @@ def read_poses_bounds(path: Path) -> PosesBounds:
             "a pose table must have 17 columns", where=path, got=f"shape {rows.shape}"
         )
     rows = rows.astype(np.float64)
-    broken = np.flatnonzero(~np.isfinite(rows).all(1))
-    if len(broken):
-        raise CaptureError(
-            "poses hold numbers that are not finite", where=f"{path}, row {broken[0]}"
-        )
     matrix = rows[:, :15].reshape(-1, 3, 5)
     down, right, backward, centre, intrinsics = np.moveaxis(matrix, -1, 0)
     poses = np.stack([right, down, -backward, centre], -1)
-    check_rotations(poses, path)
+    check_poses(poses, path)
     if np.ptp(intrinsics, 0).max() > 1e-3 * np.abs(intrinsics).max():
         raise CaptureError(
             "the cameras of a scene must agree in size and focal length",
@@ -77,27 +70,7 @@ def read_poses_bounds(path: Path) -> PosesBounds:
     return PosesBounds(poses, float(width), float(height), float(focal), bounds)
 
 
-def check_rotations(poses: Float64[np.ndarray, "n 3 4"], where: object) -> None:
-    """Refuse poses whose left 3x3 part is not a rotation.
-
-    Raises:
-        CaptureError: One is not orthonormal or is a mirror image.
-    """
-    rotation = poses[:, :, :3]
-    residual = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max((1, 2))
-    wrong = np.flatnonzero(~(residual < ORTHONORMAL) | (np.linalg.det(rotation) < 0))
-    if len(wrong):
-        i = wrong[0]
-        raise CaptureError(
-            f"{len(wrong)} of {len(poses)} poses have no valid rotation",
-            where=f"{where}, pose {i}",
-            got=f"R^T R is off the identity by {residual[i]:.2g},"
-            f" det R = {np.linalg.det(rotation[i]):.3f}",
-            do="check the order and sign of the axes; remove any scale from the matrix",
-        )
-
-
-def _load(path: Path) -> np.ndarray:
+def _load(path: Path) -> Shaped[np.ndarray, "..."]:
     try:
         return np.load(path, allow_pickle=False)
     except FileNotFoundError:

@@ -1,0 +1,278 @@
+"""COLMAP's own files: cameras, images and points3D, binary (`.bin`) or text (`.txt`).
+
+COLMAP stores camera-from-world quaternions and translations in OpenCV axes, with the centre of
+the first pixel at (0.5, 0.5); here they become world-from-camera matrices, sorted by image name.
+
+Source: https://colmap.github.io/format.html and the writers in COLMAP's `reconstruction_io`.
+"""
+
+import contextlib
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry import se3
+
+MODELS = {
+    "SIMPLE_PINHOLE": (0, 3),
+    "PINHOLE": (1, 4),
+    "SIMPLE_RADIAL": (2, 4),
+    "RADIAL": (3, 5),
+    "OPENCV": (4, 8),
+    "OPENCV_FISHEYE": (5, 8),
+}
+"""Camera models we know: COLMAP's number, and how many parameters."""
+
+NAMES = {number: name for name, (number, _) in MODELS.items()}
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "")
+"""Where in a scene's folder a model may be."""
+
+OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+TRACK = np.dtype([("image", "<u4"), ("observation", "<u4")])
+
+
+@dataclass(frozen=True)
+class Model:
+    """A sparse reconstruction; rows are sorted by image name."""
+
+    names: tuple[str, ...]
+    poses: Float64[np.ndarray, "n 3 4"]
+    """World-from-camera."""
+    cameras: tuple[Camera, ...]
+    """One for each image."""
+    points: Float64[np.ndarray, "m 3"]
+    seen: Int64[np.ndarray, "o 2"]
+    """Which image (row) saw which point (row)."""
+
+
+@dataclass(frozen=True)
+class _Image:
+    number: int
+    wxyz: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True)
+class _Points:
+    xyz: Float64[np.ndarray, "m 3"]
+    image: Int64[np.ndarray, "o"]
+    """COLMAP's number of each image that saw a point, point after point."""
+    row: Int64[np.ndarray, "o"]
+    """The point's row."""
+
+
+def find_model(folder: Path) -> Path | None:
+    """Where below a scene's folder a model is, or None."""
+    for place in PLACES:
+        if any((folder / place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder / place
+    return None
+
+
+def read_model(folder: Path) -> Model:
+    """Read a model; binary files are preferred where there are both.
+
+    Raises:
+        CaptureError: A file is missing, truncated or malformed, or a camera model is unknown.
+    """
+    suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
+    binary = suffix == ".bin"
+    cameras_path, images_path, points_path = (
+        folder / f"{name}{suffix}" for name in ("cameras", "images", "points3D")
+    )
+    cameras = (_binary_cameras if binary else _text_cameras)(cameras_path)
+    images = (_binary_images if binary else _text_images)(images_path)
+    points = (_binary_points if binary else _text_points)(points_path)
+    if not images:
+        raise CaptureError("the reconstruction holds no images", where=images_path)
+    images = sorted(images, key=lambda image: image.name)
+    for image in images:
+        if image.camera not in cameras:
+            raise CaptureError(
+                "an image names a camera that does not exist",
+                where=f"{images_path}, {image.name}",
+                got=f"camera {image.camera} of {sorted(cameras)}",
+            )
+    row_of = {image.number: row for row, image in enumerate(images)}
+    rows = np.array([row_of.get(int(number), -1) for number in points.image], np.int64)
+    seen = np.stack([rows, points.row], -1)[rows >= 0]
+    return Model(
+        names=tuple(image.name for image in images),
+        poses=_world_from_camera(images),
+        cameras=tuple(cameras[image.camera] for image in images),
+        points=points.xyz,
+        seen=seen,
+    )
+
+
+def camera_of(
+    model: str, width: int, height: int, parameters: tuple[float, ...], *, where: object
+) -> Camera:
+    """Our camera for COLMAP's model name and parameters."""
+    if model not in MODELS or len(parameters) != MODELS[model][1]:
+        raise CaptureError(
+            f"camera model {model} is not supported",
+            where=where,
+            got=f"{len(parameters)} parameters",
+            do=f"use one of {', '.join(MODELS)}, or undistort with `colmap image_undistorter`",
+        )
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        (focal, cx, cy), bent = parameters[:3], parameters[3:]
+        fx = fy = focal
+    else:
+        (fx, fy, cx, cy), bent = parameters[:4], parameters[4:]
+    if not any(bent) and model != "OPENCV_FISHEYE":
+        return Camera(width, height, fx, fy, cx, cy)
+    if model == "OPENCV_FISHEYE":
+        return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple(bent))
+    brown = (*bent, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]  # k1, k2, p1, p2, k3; what is not given is zero
+    return Camera(width, height, fx, fy, cx, cy, "brown", brown)
+
+
+def _world_from_camera(images: list[_Image]) -> Float64[np.ndarray, "n 3 4"]:
+    wxyz = torch.tensor([image.wxyz for image in images], dtype=torch.float64)
+    translation = torch.tensor([image.translation for image in images], dtype=torch.float64)
+    rotation = se3.rotation_from_quaternion(wxyz)
+    return se3.inverse(torch.cat([rotation, translation[..., None]], -1)).numpy()
+
+
+class _Bytes:
+    """Reads a binary file from its start, and says so if it ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, _found(path).read_bytes(), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """Little-endian numbers, as in `struct`."""
+        size = struct.calcsize("<" + layout)
+        self._need(size)
+        values = struct.unpack_from("<" + layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def array(self, dtype: np.dtype, count: int) -> np.ndarray:
+        """`count` records."""
+        self._need(count * dtype.itemsize)
+        values = np.frombuffer(self.data, dtype, count, self.at)
+        self.at += count * dtype.itemsize
+        return values
+
+    def text(self) -> str:
+        """Characters up to a zero byte."""
+        end = self.data.find(b"\0", self.at)
+        self._need(end - self.at + 1 if end >= 0 else len(self.data) + 1)
+        value = self.data[self.at : end].decode("utf-8", "replace")
+        self.at = end + 1
+        return value
+
+    def _need(self, size: int) -> None:
+        if self.at + size > len(self.data):
+            raise CaptureError(
+                "COLMAP file is truncated",
+                where=self.path,
+                got=f"{len(self.data)} bytes; more are needed after byte {self.at}",
+                do="copy it again",
+            )
+
+
+def _binary_cameras(path: Path) -> dict[int, Camera]:
+    data, cameras = _Bytes(path), {}
+    for _ in range(data.take("Q")[0]):
+        number, model, width, height = data.take("IiQQ")
+        name = NAMES.get(model, f"number {model}")
+        count = MODELS[name][1] if name in MODELS else 0
+        cameras[number] = camera_of(name, width, height, data.take(f"{count}d"), where=path)
+    return cameras
+
+
+def _binary_images(path: Path) -> list[_Image]:
+    data, images = _Bytes(path), []
+    for _ in range(data.take("Q")[0]):
+        number, *pose, camera = data.take("I7dI")
+        images.append(_Image(number, tuple(pose[:4]), tuple(pose[4:]), camera, data.text()))
+        data.array(OBSERVATION, data.take("Q")[0])
+    return images
+
+
+def _binary_points(path: Path) -> _Points:
+    data, xyz, tracks = _Bytes(path), [], []
+    for _ in range(data.take("Q")[0]):
+        _, *position = data.take("Q3d3Bd")[:4]
+        xyz.append(position)
+        tracks.append(data.array(TRACK, data.take("Q")[0])["image"])
+    return _points(xyz, tracks)
+
+
+def _text_cameras(path: Path) -> dict[int, Camera]:
+    cameras = {}
+    for line in filter(None, _lines(path)):
+        with _parsing(path, line):
+            number, model, width, height, *parameters = line.split()
+            size, numbers = (int(width), int(height)), tuple(map(float, parameters))
+            cameras[int(number)] = camera_of(model, *size, numbers, where=path)
+    return cameras
+
+
+def _text_images(path: Path) -> list[_Image]:
+    images = []
+    # Every second line lists 2-D points, and may be empty.
+    for line in filter(None, _lines(path)[::2]):
+        with _parsing(path, line):
+            number, *rest = line.split(maxsplit=9)
+            pose, camera, name = [float(v) for v in rest[:7]], int(rest[7]), rest[8]
+            images.append(_Image(int(number), tuple(pose[:4]), tuple(pose[4:]), camera, name))
+    return images
+
+
+def _text_points(path: Path) -> _Points:
+    xyz, tracks = [], []
+    for line in filter(None, _lines(path)):
+        with _parsing(path, line):
+            fields = line.split()
+            xyz.append([float(v) for v in fields[1:4]])
+            tracks.append(np.array(fields[8::2], np.int64))
+    return _points(xyz, tracks)
+
+
+def _points(xyz: list[list[float]], tracks: list[np.ndarray]) -> _Points:
+    """Points, and the images that saw each."""
+    lengths = [len(track) for track in tracks]
+    return _Points(
+        xyz=np.array(xyz, np.float64).reshape(-1, 3),
+        image=np.concatenate([*tracks, np.zeros(0, np.int64)]).astype(np.int64),
+        row=np.repeat(np.arange(len(xyz), dtype=np.int64), lengths),
+    )
+
+
+def _lines(path: Path) -> list[str]:
+    text = _found(path).read_text(encoding="utf-8", errors="replace")
+    return [line for line in text.splitlines() if not line.startswith("#")]
+
+
+@contextlib.contextmanager
+def _parsing(path: Path, line: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, IndexError):
+        raise CaptureError("cannot read a line of a COLMAP file", where=path, got=line) from None
+
+
+def _found(path: Path) -> Path:
+    if not path.is_file():
+        raise CaptureError(
+            "COLMAP file not found",
+            where=path,
+            do="a model is cameras, images and points3D, all .bin or all .txt",
+        )
+    return path
