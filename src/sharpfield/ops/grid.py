@@ -1,0 +1,108 @@
+"""Features looked up in planes and lines that factor a volume.
+
+Vocabulary: a *plane* `[h, w, c]` and a *line* `[l, c]` hold features at their cells, channels last,
+so that the features of a cell lie side by side in memory. A *volume* is three pairs, each the
+product of a plane along two axes and a line along the third. Points are in box coordinates: -1 and
+1 are the centres of the first and last cell along each axis. Lookups are (bi)linear; cells outside
+count as zero, so a feature fades out over one cell beyond the box and is zero further off.
+
+Source: vector-matrix factorisation, TensoRF (ECCV 2022), eq. 3; shapes from PDRF (AAAI 2023).
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.ops._dispatch import Op
+
+PAIRS = ((0, 1, 2), (0, 2, 1), (1, 2, 0))
+"""Of each pair: the axis along the plane's columns, along its rows, and along the line."""
+
+
+def grid_shape(box: Float[Tensor, "2 3"], voxels: int) -> tuple[int, int, int]:
+    """Cells along x, y and z so that cubic voxels fill a box with about `voxels` of them.
+
+    The edge is h = (dx dy dz / voxels)^(1/3); each axis gets floor(extent / h) cells, at least 2.
+
+    Args:
+        box: Low and high corner.
+        voxels: Budget of the whole box.
+    """
+    extent = (box[1].double() - box[0].double()).tolist()
+    edge = (math.prod(extent) / voxels) ** (1 / 3)
+    x, y, z = (max(int(length / edge), 2) for length in extent)
+    return x, y, z
+
+
+def plane_features(
+    points: Float[Tensor, "*b 2"], plane: Float[Tensor, "h w c"]
+) -> Float[Tensor, "*b c"]:
+    """Bilinear lookup in one plane.
+
+    Args:
+        points: Column and row in box coordinates.
+        plane: Features by row and column.
+    """
+    grid = points.reshape(1, 1, -1, 2)
+    image = plane.permute(2, 0, 1)[None]
+    found = F.grid_sample(image, grid, padding_mode="zeros", align_corners=True)
+    return found[0, :, 0].T.reshape(*points.shape[:-1], plane.shape[-1])
+
+
+def line_features(points: Float[Tensor, "*b"], line: Float[Tensor, "l c"]) -> Float[Tensor, "*b c"]:
+    """Linear lookup in one line.
+
+    Args:
+        points: Place along the line in box coordinates.
+        line: Features by cell.
+    """
+    on_plane = torch.stack([torch.zeros_like(points), points], -1)
+    return plane_features(on_plane, line[:, None])
+
+
+@Op
+def plane_line_features(
+    points: Float[Tensor, "*b 3"],
+    planes: Sequence[Float[Tensor, "_ _ _"]],
+    lines: Sequence[Float[Tensor, "_ _"]],
+) -> Float[Tensor, "*b f"]:
+    """Features of a volume: plane times line of each pair, one pair after the other.
+
+    Args:
+        points: x, y and z in box coordinates.
+        planes: xy `[y, x, c0]`, xz `[z, x, c1]` and yz `[z, y, c2]`.
+        lines: z `[z, c0]`, y `[y, c1]` and x `[x, c2]`.
+
+    Returns:
+        c0 + c1 + c2 features per point.
+    """
+    pairs = [
+        plane_features(points[..., (column, row)], plane) * line_features(points[..., along], line)
+        for (column, row, along), plane, line in zip(PAIRS, planes, lines, strict=True)
+    ]
+    return torch.cat(pairs, -1)
+
+
+@Op
+def plane_line_mixture(
+    points: Float[Tensor, "*b 3"],
+    planes: Sequence[Float[Tensor, "_ _ _"]],
+    lines: Sequence[Float[Tensor, "_ _"]],
+    basis: Float[Tensor, "f m"],
+) -> Float[Tensor, "*b m"]:
+    """Features of a volume times one matrix: `plane_line_features(...) @ basis`.
+
+    A version may work through the points in chunks, so that the wide features of all points are
+    never in memory at once.
+
+    Args:
+        points: See `plane_line_features`.
+        planes: See `plane_line_features`.
+        lines: See `plane_line_features`.
+        basis: A column of weights per mixed feature; the transpose of a linear layer's weight.
+    """
+    return plane_line_features.reference(points, planes, lines) @ basis
