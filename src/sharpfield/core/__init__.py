@@ -15,8 +15,8 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.protocols import Field, Formation, Model, Recipe, Renderer, Trajectory
-from sharpfield.core.radiance import Emission, Radiance
+from sharpfield.core.protocols import Field, Formation, Head, Model, Recipe, Renderer, Trajectory
+from sharpfield.core.radiance import Radiance, Samples
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.struct import Struct
@@ -27,7 +27,6 @@ __all__ = [
     "Capture",
     "CaptureError",
     "Clock",
-    "Emission",
     "EventPairs",
     "EventStream",
     "Exposure",
@@ -35,6 +34,7 @@ __all__ = [
     "Formation",
     "Frames",
     "Group",
+    "Head",
     "MissingExtra",
     "Model",
     "OptionError",
@@ -45,6 +45,7 @@ __all__ = [
     "Recipe",
     "Renderer",
     "RunError",
+    "Samples",
     "Schedule",
     "ShapeError",
     "SharpfieldError",

@@ -12,7 +12,7 @@ from torch import Generator, Tensor
 
 from sharpfield.core.measurements import Batch
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Emission, Radiance
+from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group
 
@@ -42,16 +42,51 @@ class Trajectory(Protocol):
 
 
 @runtime_checkable
-class Field(Protocol):
-    """A sharp scene: the light that points send in a direction at a time."""
+class Head(Protocol):
+    """A small network that turns what was looked up at points into density and colour.
 
-    def __call__(
+    The two are apart so that a renderer can leave out the colour of points nobody sees.
+    """
+
+    def density(
+        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+    ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
+        """Density before its activation, and the hidden features that colour is made from."""
+        ...
+
+    def colour(
+        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+    ) -> Float[Tensor, "*b s c"]:
+        """Linear colour, 0...1, seen along one direction per ray."""
+        ...
+
+
+@runtime_checkable
+class Field(Protocol):
+    """A sharp scene, asked in two stages: a coarse look, then a fine one where it matters.
+
+    Looking up features is apart from the heads because it is memory-bound and its result small,
+    while the heads are compute-bound and their activations large: a renderer may recompute heads
+    in the backward pass, chunk by chunk, and keep only what was looked up.
+    """
+
+    coarse: Head
+    fine: Head
+
+    def look(
+        self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
+    ) -> Float[Tensor, "*b s f"]:
+        """Features for the coarse head; `time` belongs to the whole ray."""
+        ...
+
+    def look_closer(
         self,
-        points: Float[Tensor, "*b s 3"],
-        direction: Float[Tensor, "*b 3"],
+        looked: Float[Tensor, "*b s f"],
+        old: Float[Tensor, "*b s 3"],
+        new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],
-    ) -> Emission:
-        """Emission at `s` points on each ray; direction and time belong to the whole ray."""
+    ) -> Float[Tensor, "*b t g"]:
+        """Features for the fine head at the old points, then the new ones; t = s + m."""
         ...
 
 
@@ -60,7 +95,7 @@ class Renderer(Protocol):
     """Light gathered along rays."""
 
     def __call__(self, rays: Rays, generator: Generator | None = None) -> Radiance:
-        """Radiance of rays; with a generator, samples are jittered and regularised for training."""
+        """Radiance of rays; with a generator, samples are jittered and noisy, for training."""
         ...
 
 

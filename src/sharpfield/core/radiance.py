@@ -1,4 +1,4 @@
-"""Light: what a field emits at points, and what gathering it along rays gives."""
+"""Light gathered along rays, and the points it was gathered from."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,15 +10,17 @@ from sharpfield.core.struct import Struct
 
 
 @dataclass(frozen=True)
-class Emission(Struct):
-    """What a field returns at points along rays."""
+class Samples(Struct):
+    """Points along rays, near to far, with what a field found there."""
 
-    trailing: ClassVar = {"rgb": 1}
+    trailing: ClassVar = {"depth": 1, "feature": 2, "direction": 1}
 
-    density: Float[Tensor, "*b"]
-    """Before any activation, so that a renderer may add noise first."""
-    rgb: Float[Tensor, "*b c"]
-    """Linear, 0...1."""
+    depth: Float[Tensor, "*b s"]
+    """Ray parameter of each point, in the renderer's space."""
+    feature: Float[Tensor, "*b s f"]
+    """Hidden features of the fine head."""
+    direction: Float[Tensor, "*b 3"]
+    """Of the ray, in the renderer's space; its length matters."""
 
 
 @dataclass(frozen=True)
@@ -36,4 +38,6 @@ class Radiance(Struct):
     weight: Float[Tensor, "*b"]
     """The rays' weights, carried along for `formation.mix`."""
     coarse: "Radiance | None" = None
-    """What the coarse field alone would give, where there are two."""
+    """What the coarse head alone would give, where there are two."""
+    samples: Samples | None = None
+    """The points it was gathered from, if they were asked for."""

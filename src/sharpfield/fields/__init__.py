@@ -1,0 +1,6 @@
+"""Fields: what a sharp scene emits, at points, in directions, at times."""
+
+from sharpfield.fields.mlp import MLPField
+from sharpfield.fields.plane_grid import HeadSize, PlaneField, Volume
+
+__all__ = ["HeadSize", "MLPField", "PlaneField", "Volume"]

@@ -1,0 +1,93 @@
+"""The field of NeRF: two large networks of position and direction, and nothing looked up.
+
+Source: NeRF (ECCV 2020), appendix A.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.ops.dense import Dense, SplitLinear, linear
+from sharpfield.ops.encoding import frequencies, frequencies_width
+
+
+class MLPHead(nn.Module):
+    """Eight wide layers with a skip, then a short branch that sees the direction.
+
+    Args:
+        width: Of the layers; 256 in the paper.
+        depth: Number of layers; the input is seen again after half of them.
+        generator: Where the first parameters come from.
+        position: Octaves of the position's encoding.
+        direction: Octaves of the direction's encoding.
+    """
+
+    def __init__(
+        self,
+        *,
+        generator: torch.Generator,
+        width: int = 256,
+        depth: int = 8,
+        position: int = 10,
+        direction: int = 4,
+    ) -> None:
+        super().__init__()
+        self.position, self.direction = position, direction
+        sizes = [frequencies_width(3, position), *([width] * depth)]
+        self.trunk = Dense(sizes, generator=generator, skips=(depth // 2 + 1,))
+        self.to_density = linear(width, 1, generator=generator)
+        self.to_feature = linear(width, width, generator=generator)
+        self.first = SplitLinear(
+            width, frequencies_width(3, direction), width // 2, generator=generator
+        )
+        self.last = linear(width // 2, 3, generator=generator)
+
+    def density(
+        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+    ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
+        """Density before its activation, and the features of the trunk."""
+        hidden = torch.relu(self.trunk(frequencies(points, self.position)))
+        return self.to_density(hidden)[..., 0], hidden
+
+    def colour(
+        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+    ) -> Float[Tensor, "*b s 3"]:
+        """Linear colour, 0...1."""
+        ray = frequencies(direction, self.direction)
+        seen = torch.relu(self.first(self.to_feature(hidden), ray))
+        return torch.sigmoid(self.last(seen))
+
+
+class MLPField(nn.Module):
+    """A coarse and a fine network of the same shape, as in NeRF.
+
+    Args:
+        generator: Where the first parameters come from.
+        width: Of the layers.
+        depth: Number of layers.
+    """
+
+    def __init__(self, *, generator: torch.Generator, width: int = 256, depth: int = 8) -> None:
+        super().__init__()
+        self.coarse = MLPHead(generator=generator, width=width, depth=depth)
+        self.fine = MLPHead(generator=generator, width=width, depth=depth)
+
+    def look(
+        self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
+    ) -> Float[Tensor, "*b s 0"]:
+        """Nothing: the networks see the position itself."""
+        return points[..., :0]
+
+    def look_closer(
+        self,
+        looked: Float[Tensor, "*b s 0"],
+        old: Float[Tensor, "*b s 3"],
+        new: Float[Tensor, "*b m 3"],
+        time: Float[Tensor, "*b"],
+    ) -> Float[Tensor, "*b t 0"]:
+        """Nothing."""
+        return torch.cat([old, new], -2)[..., :0]
+
+    def grids(self) -> list[nn.Parameter]:
+        """None."""
+        return []

@@ -1,0 +1,182 @@
+"""A field of factored feature volumes with a small network on each: fast, and sharp.
+
+A *volume* is three planes times three lines of features (vector-matrix factorisation, TensoRF,
+ECCV 2022). The coarse head sees one volume, the fine head that one and a finer one (PDRF, AAAI
+2023); both also get the frequency-encoded position. Positions are those of the renderer's space.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.ops.dense import Dense, SplitLinear, linear
+from sharpfield.ops.encoding import frequencies, frequencies_width
+from sharpfield.ops.grid import grid_shape, plane_line_mixture
+
+CHANNELS = (64, 16, 16)
+"""Features of the xy, xz and yz plane (Ev-DeblurNeRF's recipes)."""
+
+
+@dataclass(frozen=True)
+class HeadSize:
+    """Widths of a head: hidden layer of the density network, its features, the colour layers."""
+
+    hidden: int
+    feature: int
+    colour: int
+
+
+COARSE = HeadSize(hidden=64, feature=15, colour=64)
+FINE = HeadSize(hidden=256, feature=128, colour=256)
+
+
+class Volume(nn.Module):
+    """Features in a box: sum over planes times lines, mixed by one matrix.
+
+    Args:
+        box: Low and high corner.
+        voxels: How many voxels a dense grid of this resolution would have.
+        features: Width of the result.
+        generator: Where the first parameters come from.
+        channels: Features of the three planes and their lines.
+        spread: Standard deviation of the first values.
+    """
+
+    def __init__(
+        self,
+        box: Float[Tensor, "2 3"],
+        voxels: int,
+        features: int,
+        *,
+        generator: torch.Generator,
+        channels: tuple[int, int, int] = CHANNELS,
+        spread: float = 0.1,
+    ) -> None:
+        super().__init__()
+        self.register_buffer("box", box.float(), persistent=False)
+        nx, ny, nz = grid_shape(box, voxels)
+        xy, xz, yz = channels
+
+        def values(*shape: int) -> nn.Parameter:
+            return nn.Parameter(spread * torch.randn(shape, generator=generator))
+
+        self.planes = nn.ParameterList([values(ny, nx, xy), values(nz, nx, xz), values(nz, ny, yz)])
+        self.lines = nn.ParameterList([values(nz, xy), values(ny, xz), values(nx, yz)])
+        self.basis = linear(sum(channels), features, generator=generator, bias=False)
+
+    def forward(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b f"]:
+        """Features at points; zero outside the box, with a fade of one voxel."""
+        low, high = self.box
+        place = (points - low) * (2 / (high - low)) - 1
+        basis = self.basis.weight.T
+        return plane_line_mixture(place, list(self.planes), list(self.lines), basis)
+
+
+class PlaneHead(nn.Module):
+    """Density and colour from looked-up features and the encoded position.
+
+    Args:
+        looked: Width of the looked-up features.
+        size: Widths of the layers.
+        generator: Where the first parameters come from.
+        position: Octaves of the position's encoding.
+        direction: Octaves of the direction's encoding.
+        precision: What the layers compute in; parameters, density and colour stay float32.
+    """
+
+    def __init__(
+        self,
+        looked: int,
+        size: HeadSize,
+        *,
+        generator: torch.Generator,
+        position: int = 10,
+        direction: int = 4,
+        precision: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        self.position, self.direction, self.precision = position, direction, precision
+        width = looked + frequencies_width(3, position)
+        self.body = Dense(
+            [width, size.hidden, size.feature + 1], generator=generator, bias=False
+        )
+        self.first = SplitLinear(
+            size.feature,
+            frequencies_width(3, direction),
+            size.colour,
+            generator=generator,
+            bias=False,
+        )
+        self.last = Dense([size.colour, size.colour, 3], generator=generator, bias=False)
+
+    def density(
+        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+    ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
+        """Density before its activation, and features for the colour."""
+        encoded = torch.cat([looked, frequencies(points, self.position)], -1)
+        out = self.body(encoded.to(self.precision))
+        return out[..., 0].float(), out[..., 1:]
+
+    def colour(
+        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+    ) -> Float[Tensor, "*b s 3"]:
+        """Linear colour, 0...1."""
+        ray = frequencies(direction, self.direction).to(hidden.dtype)
+        return torch.sigmoid(self.last(torch.relu(self.first(hidden, ray))).float())
+
+
+class PlaneField(nn.Module):
+    """A coarse and a fine volume with a head each.
+
+    Args:
+        box: Low and high corner of the scene in the renderer's space.
+        voxels: Voxels of the coarse and of the fine volume.
+        generator: Where the first parameters come from.
+        heads: Widths of the coarse and of the fine head.
+        features: Width of what one look-up gives.
+        channels: Features of the planes of both volumes.
+        precision: What the fine head computes in.
+    """
+
+    def __init__(
+        self,
+        box: Float[Tensor, "2 3"],
+        voxels: tuple[int, int],
+        *,
+        generator: torch.Generator,
+        heads: tuple[HeadSize, HeadSize] = (COARSE, FINE),
+        features: int = 32,
+        channels: tuple[int, int, int] = CHANNELS,
+        precision: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        self.volumes = nn.ModuleList(
+            Volume(box, count, features, generator=generator, channels=channels)
+            for count in voxels
+        )
+        self.coarse = PlaneHead(features, heads[0], generator=generator, precision=precision)
+        self.fine = PlaneHead(2 * features, heads[1], generator=generator, precision=precision)
+
+    def look(
+        self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
+    ) -> Float[Tensor, "*b s f"]:
+        """Features of the coarse volume; the scene stands still, so time does not matter."""
+        return self.volumes[0](points)
+
+    def look_closer(
+        self,
+        looked: Float[Tensor, "*b s f"],
+        old: Float[Tensor, "*b s 3"],
+        new: Float[Tensor, "*b m 3"],
+        time: Float[Tensor, "*b"],
+    ) -> Float[Tensor, "*b t g"]:
+        """Features of both volumes; those of the coarse one at old points are not looked up again."""
+        wide = torch.cat([looked, self.volumes[0](new)], -2)
+        close = self.volumes[1](torch.cat([old, new], -2))
+        return torch.cat([wide, close], -1)
+
+    def grids(self) -> list[nn.Parameter]:
+        """Planes and lines of both volumes: what total variation smooths."""
+        return [grid for volume in self.volumes for grid in (*volume.planes, *volume.lines)]

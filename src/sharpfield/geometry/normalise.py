@@ -1,0 +1,52 @@
+"""A capture in a space of its own: near things at a fixed depth, the average camera at the origin."""
+
+import dataclasses
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from sharpfield.core.capture import Capture
+from sharpfield.geometry.space import Similarity, normalisation
+from sharpfield.geometry.trajectory import Moved
+
+REFERENCE = "reference_poses"
+"""Note of a capture that says which poses its normalisation is taken over."""
+
+PATH_SAMPLES = 256
+"""Instants at which a trajectory without frames of its own is looked at."""
+
+
+def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
+    """The poses that stand for a capture: its frames', or the moving track's.
+
+    Published data sets average over one or the other; the note `reference_poses` ("frames" or
+    "trajectory") of a capture says which. Without frames it is the trajectory.
+    """
+    known = capture.trajectory.known_us(0)
+    along = capture.notes.get(REFERENCE, "frames") == "trajectory" or capture.frames is None
+    if along and known is not None:
+        stamps = getattr(capture.trajectory, "poses", None)
+        if stamps is not None:
+            return stamps
+        time = torch.linspace(*(float(capture.clock.unit(t)) for t in known), PATH_SAMPLES)
+        return capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES).long()).double().numpy()
+    every = np.arange(len(capture.needed_frames))
+    return capture.frame_pose(every).double().numpy()
+
+
+def normalised(capture: Capture) -> tuple[Capture, Similarity]:
+    """The capture in its normalised world, and the change that leads there."""
+    change = normalisation(reference_poses(capture), capture.near)
+    return moved(capture, change), change
+
+
+def moved(capture: Capture, change: Similarity) -> Capture:
+    """A capture seen from another world."""
+    return dataclasses.replace(
+        capture,
+        trajectory=Moved(capture.trajectory, change),
+        near=capture.near * change.scale,
+        far=capture.far * change.scale,
+        points=None if capture.points is None else change.points(capture.points),
+    )

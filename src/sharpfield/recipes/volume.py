@@ -1,0 +1,122 @@
+"""The sharp scene of the volumetric recipes: a capture in its own space, a field, a renderer."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import nn
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.seed import generator
+from sharpfield.fields import HeadSize, MLPField, PlaneField
+from sharpfield.geometry.normalise import normalised, reference_poses
+from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
+from sharpfield.rendering.coarse_to_fine import CoarseToFine
+from sharpfield.rendering.gather import Compositing
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """The field, and how rays sample it. Defaults: Ev-DeblurNeRF (CVPR 2024)."""
+
+    kind: Literal["planes", "mlp"] = "planes"
+    """Factored feature volumes with small networks, or NeRF's large networks alone."""
+    voxels: tuple[int, int] = (16_777_248, 134_217_984)
+    """Resolution of the coarse and the fine volume: about 256^3 and 512^3."""
+    channels: tuple[int, int, int] = (64, 16, 16)
+    """Features of the xy, xz and yz planes."""
+    coarse: tuple[int, int, int] = (64, 15, 64)
+    """Coarse head: hidden width, features, width of the colour layers."""
+    fine: tuple[int, int, int] = (256, 128, 256)
+    """Fine head."""
+    samples: tuple[int, int] = (64, 64)
+    """Coarse points on a ray, and fine points added to them."""
+    noise: float = 1.0
+    """Standard deviation of the noise on raw density while training."""
+    density: Literal["relu", "softplus"] = "relu"
+    """From raw density to density."""
+    space: Literal["auto", "ndc", "metric"] = "auto"
+    """Normalised device coordinates, or plain distance; auto takes the first if all cameras look
+    roughly the same way."""
+    background: float = 0.0
+    """Light from behind a metric space, 0 black to 1 white."""
+    clear_before: float = 0.0
+    """In evaluation, nothing is seen up to this ray parameter (0...1); hides floaters."""
+    precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    """What the heads compute in; auto takes bfloat16 where the processor has it."""
+
+
+def soft(raw: torch.Tensor) -> torch.Tensor:
+    """A smooth density that starts thin, so that rays see through an untrained scene."""
+    return nn.functional.softplus(raw - 1)
+
+
+ACTIVATIONS = {"relu": torch.relu, "softplus": soft}
+
+
+class Volume(nn.Module):
+    """A sharp scene and the capture it explains, in the same normalised space.
+
+    Args:
+        options: Sizes and sampling.
+        capture: As read.
+        seed: Of the run.
+    """
+
+    def __init__(self, options: VolumeOptions, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.options, self.seed = options, seed
+        self.capture, self.change = normalised(capture)
+        self.path = self.capture.trajectory
+        poses = reference_poses(self.capture)
+        self.space = _space(options, self.capture, poses)
+        made = generator(seed, 0, "field")
+        if options.kind == "mlp":
+            self.field = MLPField(generator=made)
+        else:
+            box = self.space.box(torch.from_numpy(poses).float())
+            self.field = PlaneField(
+                box,
+                options.voxels,
+                generator=made,
+                heads=(HeadSize(*options.coarse), HeadSize(*options.fine)),
+                channels=options.channels,
+                precision=_precision(options.precision),
+            )
+        how = Compositing(
+            activation=ACTIVATIONS[options.density],
+            opaque_end=isinstance(self.space, Frustum),
+            background=options.background,
+        )
+        clear = Compositing(**{**vars(how), "clear_before": options.clear_before})
+        self.train_view = CoarseToFine(self.field, self.space, options.samples, options.noise, how)
+        self.view = CoarseToFine(self.field, self.space, options.samples, 0.0, clear)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    def grids(self) -> list[nn.Parameter]:
+        """Planes and lines: a parameter group, and what total variation smooths."""
+        return self.field.grids()
+
+    def networks(self) -> list[nn.Parameter]:
+        """All other parameters of the field."""
+        grids = {id(grid) for grid in self.grids()}
+        return [p for p in self.field.parameters() if id(p) not in grids]
+
+
+def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space:
+    in_frustum = options.space == "ndc" or (options.space == "auto" and forward_facing(poses))
+    if in_frustum:
+        return Frustum(capture.camera)
+    return Metric(capture.camera, capture.near, capture.far)
+
+
+def _precision(name: str) -> torch.dtype:
+    if name == "auto":
+        fast = torch.cuda.is_available() or torch.cpu._is_avx512_bf16_supported()  # pyright: ignore
+        name = "bfloat16" if fast else "float32"
+    return getattr(torch, name)
