@@ -26,7 +26,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 
 
-def is_colmap(folder: Path) -> bool:
+def recognise(folder: Path) -> bool:
     """Whether a folder holds a COLMAP model and images, and no other layout's table of poses."""
     return (
         find_model(folder) is not None
@@ -36,7 +36,7 @@ def is_colmap(folder: Path) -> bool:
     )
 
 
-def read_colmap(
+def read(
     folder: Path,
     *,
     factor: int | None = None,

@@ -33,7 +33,7 @@ SAME_PLACE = 0.01
 """Two reconstructions are the same if no camera differs by more than this, in nearest depths."""
 
 
-def is_deblur_nerf(folder: Path) -> bool:
+def recognise(folder: Path) -> bool:
     """Whether a folder looks like such a scene: a pose table and images, but no events."""
     return (
         (folder / "poses_bounds.npy").is_file()
@@ -42,7 +42,7 @@ def is_deblur_nerf(folder: Path) -> bool:
     )
 
 
-def read_deblur_nerf(
+def read(
     folder: Path,
     *,
     factor: int | None = None,

@@ -32,12 +32,12 @@ BOUNDS = (2.0, 6.0)
 SETS = ("train", "test", "val")
 
 
-def is_nerf_synthetic(folder: Path) -> bool:
+def recognise(folder: Path) -> bool:
     """Whether a folder looks like such a scene."""
     return (folder / "transforms_train.json").is_file()
 
 
-def read_nerf_synthetic(
+def read(
     folder: Path,
     *,
     missing: Missing = "error",

@@ -46,12 +46,12 @@ NEAR, FAR = 0.1, 10.0
 """Guessed depth bounds, as multiples of the cameras' distance from what they look at."""
 
 
-def is_nerfstudio(folder: Path) -> bool:
+def recognise(folder: Path) -> bool:
     """Whether a folder looks like such a scene."""
     return (folder / "transforms.json").is_file()
 
 
-def read_nerfstudio(
+def read(
     folder: Path,
     *,
     bounds: tuple[float, float] | None = None,
