@@ -1,0 +1,80 @@
+"""Things that happen between steps: functions `(step, model, optimizer, losses)`."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from sharpfield.core.errors import RunError
+from sharpfield.core.measurements import Batch
+from sharpfield.core.protocols import Model
+from sharpfield.training.fit import Hook
+from sharpfield.training.memory import Losses
+
+
+def every(steps: int, hook: Hook, *, last: int | None = None) -> Hook:
+    """Call `hook` after every `steps` steps, and after the last of a run of `last` steps."""
+
+    def sometimes(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+        if (step + 1) % steps == 0 or step + 1 == last:
+            hook(step, model, optimizer, losses)
+
+    return sometimes
+
+
+def every_seconds(
+    seconds: float, hook: Hook, *, clock: Callable[[], float] = time.monotonic
+) -> Hook:
+    """Call `hook` after the first step that ends `seconds` or more after the last call."""
+    last = clock()
+
+    def sometimes(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+        nonlocal last
+        if clock() - last >= seconds:
+            hook(step, model, optimizer, losses)
+            last = clock()
+
+    return sometimes
+
+
+def finite(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+    """Stop at a loss that is not a finite number.
+
+    Raises:
+        RunError: Names the loss, the step, and what the batch held.
+    """
+    values = torch.stack(list(losses.values()))
+    if torch.isfinite(values).all():
+        return
+    terms = dict(zip(losses, values.tolist(), strict=True))
+    ill = [name for name, loss in losses.items() if not torch.isfinite(loss)]
+    raise RunError(
+        f"the loss {' and '.join(map(repr, ill))} is not finite",
+        where=f"step {step}; batch: {describe(model.draw(step))}",
+        got=", ".join(f"{name} {value:.4g}" for name, value in terms.items()),
+        do="lower the learning rate, or look for odd values in the batch above;"
+        " the last checkpoint is from before and still good",
+    )
+
+
+def describe(batch: Batch) -> str:
+    """What a batch holds, in one line: counts, and the range of each field."""
+    return "; ".join(
+        f"{name} ({len(seen)} {type(seen).__name__}): "
+        + ", ".join(
+            f"{field.name} {_range(value)}"
+            for field in dataclasses.fields(seen)
+            if isinstance(value := getattr(seen, field.name), Tensor)
+        )
+        for name, seen in batch.items()
+    )
+
+
+def _range(values: Tensor) -> str:
+    good = values[torch.isfinite(values)]
+    span = f"{good.min().item():.4g}...{good.max().item():.4g}" if good.numel() else "empty"
+    ill = values.numel() - good.numel()
+    return f"{span} and {ill} not finite" if ill else span

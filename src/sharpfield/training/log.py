@@ -1,0 +1,182 @@
+"""What training says while it runs: `log.csv`, TensorBoard if installed, a line or a bar.
+
+`log.csv` has one row per logged step: `step` (steps done), `seconds` (spent so far), `total`, then
+one column per loss term and per score, empty where there was none. A term that first appears later
+adds a column.
+"""
+
+import csv
+import importlib.util
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+from torch.optim import Optimizer
+
+from sharpfield.core.files import replacing
+from sharpfield.core.protocols import Model
+from sharpfield.training.memory import Losses
+
+QUIET_SECONDS = 10.0
+"""Where nobody watches (a file, a pipe), one line this often."""
+
+FIRST_COLUMNS = ["step", "seconds", "total"]
+
+
+class Table:
+    """A CSV file that grows by rows, and by columns when a new name appears."""
+
+    def __init__(self, path: Path, *, keep_to: int) -> None:
+        """Open `path`; rows beyond step `keep_to`, of work that was lost, are dropped."""
+        self.path = path
+        self.columns = list(FIRST_COLUMNS)
+        rows = []
+        if path.exists():
+            with path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                rows = [row for row in reader if _is_whole(row) and int(row["step"]) <= keep_to]
+                self.columns = list(reader.fieldnames or FIRST_COLUMNS)
+        self._rewrite(rows)
+
+    def append(self, row: Mapping[str, float | int]) -> None:
+        """Add a row; it is on disk when this returns."""
+        new = [name for name in row if name not in self.columns]
+        if new:
+            with self.path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+            self.columns += new
+            self._rewrite(rows)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self.columns, restval="").writerow(row)
+
+    def _rewrite(self, rows: list[dict[str, str]]) -> None:
+        with replacing(self.path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, restval="")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+class Log:
+    """Records losses and scores, and shows how training is getting on."""
+
+    def __init__(
+        self, run: Path, *, begin: int, end: int, seconds: float, console: Console
+    ) -> None:
+        """Log to a run's folder.
+
+        Args:
+            run: The folder.
+            begin: Step this session begins with.
+            end: Number of steps of the whole run.
+            seconds: Spent in earlier sessions.
+            console: Where to show progress.
+        """
+        self.table = Table(run / "log.csv", keep_to=begin)
+        self.board = _tensorboard(run, purge_step=begin)
+        self.end, self.console = end, console
+        self.begun = time.monotonic() - seconds
+        self.bar = Progress(
+            TextColumn("{task.completed:>{task.fields[width]}}/{task.total}"),
+            BarColumn(),
+            TextColumn("{task.fields[speed]}"),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+            TextColumn("{task.fields[losses]}"),
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+        )
+        self.task = self.bar.add_task(
+            "", total=end, completed=begin, width=len(str(end)), speed="", losses=""
+        )
+        self.pace = (begin, time.monotonic())
+        self.spoken = time.monotonic()
+
+    def __enter__(self) -> "Log":
+        self.bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.bar.stop()
+        if self.board is not None:
+            self.board.close()
+
+    @property
+    def seconds(self) -> float:
+        """Spent on the run so far, over all sessions."""
+        return time.monotonic() - self.begun
+
+    def record(self, done: int, values: Mapping[str, float]) -> None:
+        """Write the numbers there are after `done` steps."""
+        short = {name: float(f"{value:.6g}") for name, value in values.items()}
+        self.table.append({"step": done, "seconds": round(self.seconds, 3), **short})
+        if self.board is not None:
+            for name, value in values.items():
+                self.board.add_scalar(name, value, done)
+
+    def show(self, done: int, values: Mapping[str, float]) -> None:
+        """Say how far training is, how fast, and what the losses are."""
+        now = time.monotonic()
+        speed = (done - self.pace[0]) / max(now - self.pace[1], 1e-9)
+        self.pace = (done, now)
+        terms = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
+        pace = f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / max(speed, 1e-9):.1f} s/step"
+        self.bar.update(self.task, completed=done, speed=pace, losses=terms)
+        if not self.console.is_terminal and (now - self.spoken > QUIET_SECONDS or done == self.end):
+            self.spoken = now
+            left = math.ceil((self.end - done) / max(speed, 1e-9))
+            self.say(f"step {done}/{self.end}  {pace}  {left} s left  {terms}")
+
+    def say(self, line: str) -> None:
+        """Print one line, above the bar if there is one."""
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+class LogLosses:
+    """A hook that logs the mean of the losses over every `every` steps."""
+
+    def __init__(self, log: Log, *, every: int) -> None:
+        """See the class."""
+        self.log, self.every = log, every
+        self.sums: dict[str, Tensor] = {}
+        self.counts: dict[str, int] = {}
+
+    def __call__(self, step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+        """Add the losses up, without waiting for the device; log when the time has come."""
+        for name, loss in losses.items():
+            self.sums[name] = self.sums[name] + loss if name in self.sums else loss
+            self.counts[name] = self.counts.get(name, 0) + 1
+        if (step + 1) % self.every and step + 1 != self.log.end:
+            return
+        sums = torch.stack(list(self.sums.values())).tolist()
+        means = {
+            name: total / self.counts[name] for name, total in zip(self.sums, sums, strict=True)
+        }
+        self.sums, self.counts = {}, {}
+        values = {"total": sum(means.values()), **means}
+        self.log.record(step + 1, values)
+        self.log.show(step + 1, values)
+
+
+def _is_whole(row: Mapping[str | None, Any]) -> bool:
+    """Whether a row was written to its end; a killed process may leave a torn one."""
+    return None not in row and None not in row.values() and (row["step"] or "").isdigit()
+
+
+def _tensorboard(run: Path, *, purge_step: int) -> Any:
+    if importlib.util.find_spec("tensorboard") is None:
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(run / "tensorboard"), purge_step=purge_step)
