@@ -1,0 +1,136 @@
+"""What event files store, column by column, turned into what an `EventStream` holds.
+
+Files store times in ns, us, ms or s, as integers or floats; polarities as {0, 1}, {-1, +1} or
+booleans; coordinates as integers of any width or as floats, if rectified. Units are never guessed.
+"""
+
+import zipfile
+
+import numpy as np
+from jaxtyping import Int8, Int64, Shaped
+
+from sharpfield.core.errors import CaptureError, OptionError
+
+UNITS = {"ns": 1e-3, "us": 1.0, "ms": 1e3, "s": 1e6}
+"""Units of time, in us."""
+
+Stored = Shaped[np.ndarray, "n"]
+"""A column as the file has it: integers, floats or booleans."""
+
+
+def known_unit(unit: str) -> str:
+    """The unit itself.
+
+    Raises:
+        OptionError: It is none of `UNITS`.
+    """
+    if unit not in UNITS:
+        raise OptionError("unknown unit of time", got=unit, do=f"use one of {', '.join(UNITS)}")
+    return unit
+
+
+def whole_us(stored: Stored, unit: str, where: object) -> Int64[np.ndarray, "n"]:
+    """Times in whole us; finer ones are rounded, halves of a us upwards.
+
+    Raises:
+        CaptureError: A time is not finite.
+    """
+    if np.issubdtype(stored.dtype, np.floating):
+        wrong = np.flatnonzero(~np.isfinite(stored))
+        if len(wrong):
+            raise CaptureError(
+                "a time is not a finite number",
+                where=f"{where}, entry {wrong[0]}",
+                got=stored[wrong[0]],
+                do="drop these entries when converting",
+            )
+        return np.floor(stored.astype(np.float64) * UNITS[unit] + 0.5).astype(np.int64)
+    ticks = stored.astype(np.int64)
+    if unit == "ns":
+        return (ticks + 500) // 1000
+    return ticks * int(UNITS[unit])
+
+
+def polarity(stored: Stored, where: object) -> Int8[np.ndarray, "n"]:
+    """Polarities as -1 and +1, from {0, 1}, {-1, +1} or booleans.
+
+    Raises:
+        CaptureError: There is another value, or 0 and -1 both occur.
+    """
+    bright, zero, dark = stored == 1, stored == 0, stored == -1
+    wrong = np.flatnonzero(~(bright | zero | dark))
+    if len(wrong):
+        raise CaptureError(
+            "polarity must be 0 or 1, or -1 or +1",
+            where=f"{where}, event {wrong[0]}",
+            got=stored[wrong[0]],
+            do="check which column is which",
+        )
+    if zero.any() and dark.any():
+        raise CaptureError(
+            "polarity takes three values",
+            where=where,
+            got=f"{dark.sum()} times -1, {zero.sum()} times 0, {bright.sum()} times 1",
+            do="map darker events to -1 or to 0, not to both",
+        )
+    return np.where(bright, 1, -1).astype(np.int8)
+
+
+def coordinates(stored: Stored, name: str, where: object) -> Stored:
+    """Pixel coordinates as 16-bit integers, or rectified ones as floats.
+
+    Raises:
+        CaptureError: An integer does not fit, so it lies on no sensor.
+    """
+    if np.issubdtype(stored.dtype, np.floating):
+        return stored.astype(np.float32) if stored.dtype.itemsize < 4 else stored
+    if stored.dtype in (np.int16, np.uint16):
+        return stored
+    if len(stored) and (stored.min() < 0 or stored.max() > np.iinfo(np.uint16).max):
+        raise CaptureError(
+            "events lie outside the sensor",
+            where=where,
+            got=f"{name} from {stored.min()} to {stored.max()}",
+            do="check which column is which",
+        )
+    return stored.astype(np.uint16)
+
+
+class ZippedColumn:
+    """One array of an npz archive, read piece by piece, so that it need not fit in memory."""
+
+    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+        self._file = archive.open(name)
+        where = f"{archive.filename}, {name}"
+        version = np.lib.format.read_magic(self._file)
+        if version == (1, 0):
+            header = np.lib.format.read_array_header_1_0(self._file)
+        elif version == (2, 0):
+            header = np.lib.format.read_array_header_2_0(self._file)
+        else:
+            raise CaptureError("unknown version of the npy format", where=where, got=version)
+        self.shape, _, self.dtype = header
+        if self.dtype.hasobject:
+            raise CaptureError(
+                "array holds pickled Python objects, which may run code when loaded",
+                where=where,
+                do="save it as plain numbers: np.savez(path, t=t.astype(np.int64), ...)",
+            )
+        if len(self.shape) != 1 or self.dtype.kind not in "iufb":
+            raise CaptureError(
+                "an event column must be a one-dimensional array of numbers",
+                where=where,
+                got=f"shape {self.shape}, {self.dtype}",
+            )
+        self._start = self._file.tell()
+
+    def __len__(self) -> int:
+        """Stored of entries."""
+        return self.shape[0]
+
+    def __getitem__(self, part: slice) -> Stored:
+        """Entries `part.start` to `part.stop`."""
+        first, last, _ = part.indices(len(self))
+        self._file.seek(self._start + first * self.dtype.itemsize)
+        data = self._file.read(max(last - first, 0) * self.dtype.itemsize)
+        return np.frombuffer(data, self.dtype)

@@ -1,0 +1,150 @@
+"""Writing events: our superset of the DSEC layout, in as many pieces as you like.
+
+    events/{x, y, t, p}     t in us after t_offset, p 0 or 1; chunks of 65 536 events
+    ms_to_idx               number of the first event at or after each ms since t_offset
+    t_offset                us
+    site_colour/{x, y, channel}     only for rectified events of a colour sensor
+    attributes              format, version, tick_ns, width, height, bayer
+
+Blosc (zstd 1, byte shuffle) packs 20 M real events at 1.7 bytes each and gives a random 10 ms
+window in about 3 ms; without `hdf5plugin` it is gzip 1 with shuffle, which every HDF5 reads.
+"""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sharpfield.captures.event_files import CHUNK, compression_plugin
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream, checked
+from sharpfield.core.files import replacing
+
+FORMAT, VERSION = "sharpfield-events", 1
+ROWS = 65_536
+"""Events in an HDF5 chunk: what is unpacked at once."""
+
+SHORT_US = 2**32 - 1
+"""Longest recording (71 minutes) whose times fit in 4 bytes."""
+
+
+class EventWriter:
+    """Appends events to an open file; made by `writing_events`."""
+
+    def __init__(self, file: h5py.File, path: Path, *, long: bool) -> None:
+        self._file, self._path, self._long = file, path, long
+        self._count = 0
+        self._offset_us = 0
+        self._last_us: int | None = None
+        self._marks = file.create_dataset(
+            "ms_to_idx", (0,), np.uint64, maxshape=(None,), chunks=(ROWS,), **_packing()
+        )
+
+    def append(self, events: EventStream) -> None:
+        """Add events that come after all earlier ones.
+
+        Raises:
+            CaptureError: They do not, or are unsound in themselves, or differ in their sensor.
+        """
+        if not len(events):
+            return
+        checked(events, f"{self._path}, being written")
+        first, last = int(events.t_us[0]), int(events.t_us[-1])
+        if self._last_us is None:
+            self._begin(events)
+        elif first < self._last_us:
+            raise CaptureError(
+                "events to be appended begin before the last ones written",
+                where=self._path,
+                got=f"{first} us after {self._last_us} us",
+                do="append chunks in the order of time",
+            )
+        since = events.t_us - self._offset_us
+        if not self._long and since[-1] > SHORT_US:
+            raise CaptureError(
+                "the recording is longer than announced",
+                where=self._path,
+                got=f"{since[-1] / 6e7:.1f} minutes",
+            )
+        columns = {"x": events.x, "y": events.y, "t": since, "p": (events.p > 0).astype(np.uint8)}
+        for name, values in columns.items():
+            self._extend(self._file[f"events/{name}"], values)
+        known = len(self._marks)
+        marks = np.arange(known, since[-1] // 1000 + 1)
+        self._extend(self._marks, self._count + np.searchsorted(since, marks * 1000))
+        self._count += len(events)
+        self._last_us = last
+
+    def finish(self) -> None:
+        """Write what is known only at the end."""
+        if self._last_us is None:
+            for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
+                self._file.create_dataset(f"events/{name}", (0,), kind)
+        self._file["t_offset"] = np.int64(self._offset_us)
+
+    def _begin(self, events: EventStream) -> None:
+        """Make the columns, now that their types are known."""
+        self._offset_us = int(events.t_us[0]) // 1000 * 1000
+        kinds = {
+            "x": events.x.dtype,
+            "y": events.y.dtype,
+            "t": np.uint64 if self._long else np.uint32,
+            "p": np.uint8,
+        }
+        for name, kind in kinds.items():
+            self._file.create_dataset(
+                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_packing()
+            )
+
+    @staticmethod
+    def _extend(column: h5py.Dataset, values: np.ndarray) -> None:
+        start = len(column)
+        column.resize((start + len(values),))
+        column[start:] = values
+
+
+@contextmanager
+def writing_events(
+    path: Path, like: EventStream, *, span_us: int | None = None
+) -> Iterator[EventWriter]:
+    """A writer for `path`; the file appears when the block ends well, whole, or not at all.
+
+    Args:
+        path: Of the file, replaced if it exists.
+        like: Any stream of the same sensor (it may be empty): its size and colour are written.
+        span_us: Length of the recording, where it is known; a short one takes less memory to read.
+    """
+    with replacing(path) as temporary:
+        with h5py.File(temporary, "w", libver=("v110", "latest")) as file:
+            file.attrs.update(
+                format=FORMAT,
+                version=VERSION,
+                tick_ns=1000,
+                width=like.width,
+                height=like.height,
+                bayer=like.bayer,
+            )
+            if like.site_colour is not None:
+                for name in ("x", "y", "channel"):
+                    file[f"site_colour/{name}"] = getattr(like.site_colour, name)
+            writer = EventWriter(file, path, long=span_us is None or span_us > SHORT_US - 1000)
+            yield writer
+            writer.finish()
+
+
+def write_events(path: Path, events: EventStream) -> None:
+    """Write a whole stream, which may be memory-mapped."""
+    span_us = int(events.t_us[-1] - events.t_us[0]) if len(events) else 0
+    with writing_events(path, events[:0], span_us=span_us) as writer:
+        for first in range(0, len(events), CHUNK):
+            writer.append(events[first : first + CHUNK])
+
+
+def _packing() -> Mapping[str, Any]:
+    plugin = compression_plugin()
+    if plugin is not None:
+        return plugin.Blosc(cname="zstd", clevel=1, shuffle=plugin.Blosc.SHUFFLE)
+    return {"compression": "gzip", "compression_opts": 1, "shuffle": True}

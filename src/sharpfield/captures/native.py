@@ -1,0 +1,171 @@
+"""Our own layout. Writing a capture and reading it again gives exactly the same capture.
+
+capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes: to be read
+frames/NAME.png    8 or 16 bit, grey or RGB
+truth/NAME.png     sharp images at mid-exposure, where known
+events.h5          see `captures.event_writer`
+trajectory.npz     see `captures.native_trajectory`
+points.npy         sparse scene points, if any
+notes.npz          notes that are arrays, if any
+cache/             derived; delete it when you like
+"""
+
+import dataclasses
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from sharpfield.captures.arrays import load_array, load_arrays
+from sharpfield.captures.clocks import expect_overlap
+from sharpfield.captures.event_cache import read_events
+from sharpfield.captures.event_files import open_events
+from sharpfield.captures.event_writer import write_events
+from sharpfield.captures.native_frames import read_frames, write_frames
+from sharpfield.captures.native_trajectory import read_trajectory, write_trajectory
+from sharpfield.captures.toml_tables import Table, read_toml
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.core.files import replacing_folder
+
+FORMAT, VERSION = "sharpfield-capture", 1
+
+DESCRIPTION = "capture.toml"
+EVENTS = "events.h5"
+POINTS = "points.npy"
+NOTES = "notes.npz"
+NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def is_native(folder: Path) -> bool:
+    """Whether a folder has our own layout."""
+    return (folder / DESCRIPTION).is_file()
+
+
+def write_native(capture: Capture, folder: Path) -> None:
+    """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
+
+    Raises:
+        CaptureError: The folder holds something that is not a capture, or the capture holds
+            something the layout has no place for.
+    """
+    if folder.exists() and not is_native(folder) and (folder.is_file() or any(folder.iterdir())):
+        raise CaptureError(
+            "will not replace a folder that is not a capture",
+            where=folder,
+            do=f"choose another place, or empty it (a capture has {DESCRIPTION})",
+        )
+    arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
+    with replacing_folder(folder) as fresh:
+        about = {
+            "format": FORMAT,
+            "version": VERSION,
+            "name": capture.name,
+            "source": capture.source,
+            "near": float(capture.near),
+            "far": float(capture.far),
+            "camera": _camera_table(capture.camera),
+            "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
+            "trajectory": write_trajectory(capture.trajectory, fresh),
+            "notes": {k: note for k, note in capture.notes.items() if k not in arrays},
+        }
+        if capture.frames is not None:
+            about["frames"] = {"encoding": capture.frames.encoding}
+            about["frame"] = write_frames(capture.frames, capture.split, fresh)
+        if capture.events is not None:
+            write_events(fresh / EVENTS, capture.events)
+        if capture.points is not None:
+            np.save(fresh / POINTS, capture.points)
+        if arrays:
+            np.savez(fresh / NOTES, **{f"note_{key}": array for key, array in arrays.items()})
+        (fresh / DESCRIPTION).write_text(tomli_w.dumps(about), encoding="utf-8")
+
+
+def read_native(folder: Path) -> Capture:
+    """Read a capture.
+
+    Raises:
+        CaptureError: Something is missing or malformed, or does not fit together.
+    """
+    about = read_toml(folder / DESCRIPTION)
+    _expect_version(about)
+    about.expect_only(
+        *("format", "version", "name", "source", "near", "far", "camera", "clock"),
+        *("trajectory", "notes", "frames", "frame", "events"),
+    )
+    timing = about.table("clock")
+    clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
+    camera = _camera(about.table("camera"))
+    frames, split = None, NO_SPLIT
+    if "frame" in about.values:
+        encoding = about.table("frames").text("encoding")
+        frames, split = read_frames(about.tables("frame"), folder, encoding=encoding)
+    notes = dict(about.table("notes", optional=True).values)
+    if (folder / NOTES).exists():
+        stored = load_arrays(folder / NOTES)
+        notes |= {key.removeprefix("note_"): array for key, array in stored.items()}
+    return Capture(
+        camera=camera,
+        trajectory=read_trajectory(about.table("trajectory"), folder, clock),
+        clock=clock,
+        near=about.number("near"),
+        far=about.number("far"),
+        frames=frames,
+        events=_read_events(about, folder, camera, clock) if (folder / EVENTS).exists() else None,
+        split=split,
+        points=load_array(folder / POINTS) if (folder / POINTS).exists() else None,
+        name=about.text("name", folder.resolve().name),
+        source=about.text("source", "native"),
+        notes=notes,
+    )
+
+
+def _read_events(about: Table, folder: Path, camera: Camera, clock: Clock) -> EventStream:
+    """The events; `[events] unit` is for files made elsewhere, which may not say it."""
+    path = folder / EVENTS
+    unit = about.table("events", optional=True).text("unit", "")
+    with open_events(path, unit=unit or None) as file:
+        sized = file if file.size else replace(file, size=camera.size)
+        if len(sized):
+            expect_overlap(
+                sized.span_us(),
+                (clock.origin_us, clock.origin_us + clock.span_us),
+                where=path,
+                known="the capture's clock",
+                do=f'give the unit in {DESCRIPTION}: [events] unit = "ns"',
+            )
+        return read_events(sized)
+
+
+def _camera_table(camera: Camera) -> dict[str, Any]:
+    table = dataclasses.asdict(camera)
+    return table | {"distortion": list(camera.distortion)}
+
+
+def _camera(table: Table) -> Camera:
+    table.expect_only(*(field.name for field in dataclasses.fields(Camera)))
+    return Camera(
+        width=table.whole("width"),
+        height=table.whole("height"),
+        fx_px=table.number("fx_px"),
+        fy_px=table.number("fy_px"),
+        cx_px=table.number("cx_px"),
+        cy_px=table.number("cy_px"),
+        lens=table.text("lens", "pinhole"),
+        distortion=table.numbers("distortion", []),
+    )
+
+
+def _expect_version(about: Table) -> None:
+    found = about.text("format"), about.whole("version")
+    if found != (FORMAT, VERSION):
+        raise CaptureError(
+            "unknown format of capture",
+            where=about.where,
+            got=f"{found[0]} version {found[1]}",
+            do=f"this program reads {FORMAT} version {VERSION}",
+        )

@@ -1,0 +1,156 @@
+"""Frames in our own layout: one `[[frame]]` table each, and PNG files in `frames/` and `truth/`.
+
+A table gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
+"none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
+defaults in brackets.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped
+
+from sharpfield.captures.images import describe, read_images, write_image
+from sharpfield.captures.toml_tables import Table
+from sharpfield.core.capture import Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import Frames
+
+FRAMES, TRUTH = "frames", "truth"
+
+USES = {(True, False): "train", (False, True): "test", (True, True): "both", (False, False): "none"}
+"""What `use` says of a frame, by whether it is learned from and whether it is held out."""
+
+PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth")
+
+
+def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, Any]]:
+    """Write the images, and return the tables that describe the frames.
+
+    Raises:
+        CaptureError: The truth is of another size or type than the images, or the split is not
+            in the order of frames.
+    """
+    _expect_same_kind(frames)
+    for part in (split.train, split.test):
+        if (np.diff(part) <= 0).any():
+            raise CaptureError("a split must name frames in ascending order, each once", got=part)
+    index = np.arange(len(frames))
+    learned, held_out = np.isin(index, split.train), np.isin(index, split.test)
+    files = _file_names(frames.names)
+    tables = []
+    for i, file in enumerate(files):
+        write_image(folder / FRAMES / file, frames.images[i])
+        table: dict[str, Any] = {
+            "name": frames.names[i],
+            "open_us": int(frames.exposure.open_us[i]),
+            "close_us": int(frames.exposure.close_us[i]),
+            "track": int(frames.track[i]),
+            "use": USES[bool(learned[i]), bool(held_out[i])],
+        }
+        if file != f"{frames.names[i]}.png":
+            table["file"] = file
+        if frames.truth is not None:
+            table["truth"] = frames.truth_known is None or bool(frames.truth_known[i])
+            if table["truth"]:
+                write_image(folder / TRUTH / file, frames.truth[i])
+        tables.append(table)
+    return tables
+
+
+def read_frames(tables: Sequence[Table], folder: Path, *, encoding: str) -> tuple[Frames, Split]:
+    """Read what `write_frames` wrote.
+
+    Raises:
+        CaptureError: A table or an image is missing or malformed, or images differ in size.
+    """
+    for table in tables:
+        table.expect_only(*KEYS)
+    names = tuple(table.text("name") for table in tables)
+    files = [_inside(table, folder) for table in tables]
+    images = read_images([folder / FRAMES / file for file in files])
+    truth, known = _read_truth(tables, [folder / TRUTH / file for file in files], images)
+    frames = Frames(
+        images=images,
+        exposure=Exposure(
+            *(_column([table.whole(key) for table in tables]) for key in ("open_us", "close_us"))
+        ),
+        track=_column([table.whole("track", 0) for table in tables]),
+        names=names,
+        encoding=encoding,
+        truth=truth,
+        truth_known=known,
+    )
+    return frames, _split(tables)
+
+
+def _read_truth(
+    tables: Sequence[Table], paths: Sequence[Path], images: Shaped[np.ndarray, "n h w c"]
+) -> tuple[Shaped[np.ndarray, "n h w c"] | None, Shaped[np.ndarray, "n"] | None]:
+    known = np.array([table.yes("truth", False) for table in tables])
+    if not known.any():
+        return None, None
+    truth = np.zeros_like(images)
+    found = read_images([path for path, there in zip(paths, known, strict=True) if there])
+    if found.shape[1:] != images.shape[1:] or found.dtype != images.dtype:
+        raise CaptureError(
+            "sharp images differ from the frames in size or type",
+            where=paths[0].parent,
+            got=f"{describe(found[0])}, frames {describe(images[0])}",
+        )
+    truth[known] = found
+    return truth, known
+
+
+def _split(tables: Sequence[Table]) -> Split:
+    meaning = {use: key for key, use in USES.items()}
+    chosen = []
+    for table in tables:
+        use = table.text("use", "train")
+        if use not in meaning:
+            raise CaptureError(
+                "unknown use of a frame",
+                where=table.where,
+                got=use,
+                do=f"write one of {', '.join(meaning)}",
+            )
+        chosen.append(meaning[use])
+    learned, held_out = np.array(chosen).T
+    return Split(train=np.flatnonzero(learned), test=np.flatnonzero(held_out))
+
+
+def _file_names(names: Sequence[str]) -> list[str]:
+    """The names themselves where every file system can hold them, else numbers."""
+    different = len({name.casefold() for name in names}) == len(names)
+    if different and all(PLAIN_NAME.fullmatch(name) for name in names):
+        return [f"{name}.png" for name in names]
+    return [f"{i:06d}.png" for i in range(len(names))]
+
+
+def _inside(table: Table, folder: Path) -> str:
+    """The file of a frame, which must lie in the capture's own folder."""
+    file = table.text("file", f"{table.text('name')}.png")
+    root = (folder / FRAMES).resolve()
+    if not (root / file).resolve().is_relative_to(root):
+        raise CaptureError("a frame's file lies outside the capture", where=table.where, got=file)
+    return file
+
+
+def _expect_same_kind(frames: Frames) -> None:
+    truth = frames.truth
+    if truth is None:
+        return
+    if truth.shape != frames.images.shape or truth.dtype != frames.images.dtype:
+        raise CaptureError(
+            "sharp images must have the size and type of the frames",
+            got=f"{truth.dtype} {truth.shape}, frames {frames.images.dtype} {frames.images.shape}",
+        )
+
+
+def _column(values: Sequence[int]) -> Shaped[np.ndarray, "n"]:
+    return np.array(values, np.int64)
