@@ -1,0 +1,175 @@
+"""What an event camera's pixels are like: thresholds, dead time, noise, bandwidth, colour.
+
+A pixel watches the logarithm of its light and reports each time it has changed by a threshold
+since the last report. Real pixels differ in all that `EventSensor` lists.
+
+Source: ESIM (Rebecq et al., CoRL 2018) for the ideal pixel; v2e (Hu et al., CVPRW 2021) for leak,
+shot noise and bandwidth; Robust e-NeRF (Low and Lee, ICCV 2023) for the reset at the end of the
+refractory period.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt64
+
+from sharpfield.core.errors import OptionError
+from sharpfield.core.seed import number, numpy_generator
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Rec.601 weights, applied to linear RGB."""
+LEAST_THRESHOLD = 0.01
+"""No pixel is more sensitive than this, in natural log."""
+LIN_LOG_KNEE = 20 / 255
+"""Below this intensity the lin-log curve is straight."""
+BRIGHT_SHOT = 0.25
+"""Shot noise of a fully lit pixel, as a share of that in the dark (v2e)."""
+DARK_SPEED = 0.1
+"""Bandwidth in the dark, as a share of that in full light (v2e)."""
+
+
+@dataclass(frozen=True)
+class EventSensor:
+    """The numbers of an event camera; the defaults are an ideal one."""
+
+    threshold_on: float = 0.2
+    """Mean contrast threshold of ON events, natural log."""
+    threshold_off: float = 0.2
+    """Mean contrast threshold of OFF events, natural log."""
+    threshold_sigma: float = 0.0
+    """Standard deviation of the thresholds over the pixels, natural log."""
+    refractory_us: float = 0.0
+    """Dead time after an event."""
+    refractory_rule: Literal["drop", "reset"] = "drop"
+    """In the dead time, crossings are dropped and the reference moves; or the pixel is held, and
+    its reference is reset to the present light at the end."""
+    leak_hz: float = 0.0
+    """ON events per second without any change of light, from leaking junctions."""
+    leak_jitter: float = 0.0
+    """Standard deviation of leak intervals, as a share of their mean."""
+    shot_hz: float = 0.0
+    """Noise events per second and pixel in the dark; they fall off with light."""
+    hot_share: float = 0.0
+    """Share of pixels that are hot."""
+    hot_hz: float = 100.0
+    """ON events per second of a hot pixel."""
+    cutoff_hz: float = 0.0
+    """Bandwidth of a fully lit pixel, a first-order low-pass on the log; slower in the dark.
+    0 for a pixel that follows at once."""
+    bayer: str = ""
+    """Colour filter tile, e.g. "RGGB"; "" for a grey sensor, which sees Rec.601 luma."""
+    curve: Literal["log", "lin-log"] = "log"
+    floor: float = 1e-5
+    """Added to linear intensity before the logarithm."""
+    start: Literal["light", "random"] = "light"
+    """Reference at the first instant: the light itself, or anywhere between the thresholds."""
+
+    def __post_init__(self) -> None:
+        if not (self.threshold_on > 0 and self.threshold_off > 0):
+            raise OptionError(
+                "contrast thresholds must be positive",
+                got=f"on {self.threshold_on}, off {self.threshold_off}",
+                do="typical sensors have 0.1 to 0.5 in natural log",
+            )
+        if self.bayer and (len(self.bayer) != 4 or set(self.bayer) - set("RGB")):
+            raise OptionError(
+                "unknown colour filter tile", got=self.bayer, do='use for example "RGGB", or ""'
+            )
+        if self.refractory_rule not in ("drop", "reset"):
+            raise OptionError(
+                "unknown refractory rule", got=self.refractory_rule, do='use "drop" or "reset"'
+            )
+
+
+DVS346 = EventSensor(
+    threshold_on=0.22,
+    threshold_off=0.22,
+    threshold_sigma=0.025,
+    refractory_us=200.0,
+    refractory_rule="reset",
+    leak_hz=0.1,
+    leak_jitter=0.3,
+    shot_hz=1.0,
+    hot_share=2e-4,
+    cutoff_hz=400.0,
+    start="random",
+)
+"""Numbers of the order that v2e found for a DAVIS346 in moderate light."""
+
+SENSORS: dict[str, EventSensor] = {"ideal": EventSensor(), "dvs346": DVS346}
+"""Sensors by name."""
+
+
+class Pixels(NamedTuple):
+    """What is fixed in each pixel, and what it remembers; the memory is written by the kernel."""
+
+    on: Float64[np.ndarray, "n"]
+    off: Float64[np.ndarray, "n"]
+    leak: Float64[np.ndarray, "n"]
+    """Log units per ns."""
+    level: Float64[np.ndarray, "n"]
+    """What the comparator sees: log intensity, after the low-pass."""
+    reference: Float64[np.ndarray, "n"]
+    """What it is compared with."""
+    ready_ns: Int64[np.ndarray, "n"]
+    """End of the dead time; before all time if there is none."""
+    hazard: Float64[np.ndarray, "n"]
+    """What is left of an exponential variable; a noise event falls where it runs out."""
+    random: UInt64[np.ndarray, "n"]
+    """State of each pixel's own generator."""
+
+
+def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int) -> Pixels:
+    """Draw a sensor's pixels, looking at light of a first `level`.
+
+    What a pixel draws depends on the seed and its index alone.
+    """
+    n = len(level)
+    draw = numpy_generator(seed, 0, "event pixels")
+    spread = sensor.threshold_sigma * draw.standard_normal((2, n))
+    on = np.maximum(sensor.threshold_on + spread[0], LEAST_THRESHOLD)
+    off = np.maximum(sensor.threshold_off + spread[1], LEAST_THRESHOLD)
+    hot = draw.random(n) < sensor.hot_share
+    leak = on * 1e-9 * (sensor.leak_hz + hot * sensor.hot_hz)
+    place = draw.random(n)
+    reference = level.copy()
+    if sensor.start == "random":
+        reference += off - place * (on + off)
+    indices = np.arange(n, dtype=np.uint64) + np.uint64(number(seed, 0, "event noise"))
+    return Pixels(
+        on=on,
+        off=off,
+        leak=leak,
+        level=level.copy(),
+        reference=reference,
+        ready_ns=np.full(n, np.iinfo(np.int64).min),
+        hazard=draw.standard_exponential(n),
+        random=indices * np.uint64(0x9E3779B97F4A7C15),
+    )
+
+
+def brightness(
+    rgb: Float32[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w"], bayer: str
+) -> Float32[np.ndarray, "h w"]:
+    """The linear intensity that falls on each pixel: luma, or its filter's own channel."""
+    if rgb.ndim == 2:
+        return rgb
+    if not bayer:
+        return rgb @ LUMA
+    seen = np.empty(rgb.shape[:2], np.float32)
+    for corner, colour in enumerate(bayer):
+        row, column = divmod(corner, 2)
+        seen[row::2, column::2] = rgb[row::2, column::2, "RGB".index(colour)]
+    return seen
+
+
+def log_intensity(
+    light: Float32[np.ndarray, "h w"], sensor: EventSensor
+) -> Float64[np.ndarray, "n"]:
+    """What a photoreceptor puts out: the logarithm, or lin-log, which is straight in the dark."""
+    value = light.reshape(-1).astype(np.float64) + sensor.floor
+    if sensor.curve == "log":
+        return np.log(value)
+    straight = np.log(LIN_LOG_KNEE) + value / LIN_LOG_KNEE - 1
+    return np.where(value < LIN_LOG_KNEE, straight, np.log(np.maximum(value, LIN_LOG_KNEE)))

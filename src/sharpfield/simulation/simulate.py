@@ -1,0 +1,210 @@
+"""One call from a scene to a capture: blurry frames, events, poses and sharp truth on one clock.
+
+Frames follow the published Ev-DeblurNeRF data: one exposure every interval, blurred by the
+camera's motion, but every eighth a sharp view at the middle of its slot, held out for testing.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from os import cpu_count
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import OptionError
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import Frames
+from sharpfield.core.seed import numpy_generator
+from sharpfield.simulation.blur import Exposing, FrameSensor, store
+from sharpfield.simulation.event_sensor import EventSensor
+from sharpfield.simulation.events import EventPixels, joined, watch
+from sharpfield.simulation.motion import Motion, motion, stamped
+from sharpfield.simulation.scenes import Scene, scene
+
+AHEAD = 32
+"""Pictures drawn ahead by all cores; bounds memory."""
+MARGIN_US = 10_000
+"""The camera is watched for this long before the first exposure and after the last."""
+FOCAL_OF_WIDTH = 0.92
+"""Focal length of the simulated camera over the image width: 57 degrees across."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the shutter opens, and how finely light is sampled."""
+
+    frames: int = 18
+    exposure_us: int = 50_000
+    interval_us: int = 56_000
+    """From one exposure's start to the next."""
+    step_us: int = 1000
+    """Between two pictures of the scene: 1000 for a camera of 1000 pictures per second."""
+    most_change: float = 0.0
+    """Largest change of log intensity between two pictures, which are placed closer where it is
+    exceeded; 0 for even steps."""
+    test_every: int = 8
+    """Every how many frames one is sharp and held out, the first included; 0 for none."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.exposure_us < 1 or self.step_us < 1:
+            raise OptionError(
+                "frames, exposure and step must be positive",
+                got=f"{self.frames}, {self.exposure_us} us, {self.step_us} us",
+            )
+        if self.interval_us < self.exposure_us:
+            raise OptionError(
+                "exposures would overlap",
+                got=f"one of {self.exposure_us} us every {self.interval_us} us",
+                do="make the interval at least as long as the exposure",
+            )
+
+    @property
+    def test(self) -> Int64[np.ndarray, "a"]:
+        """Indices of the sharp frames that are held out."""
+        if not self.test_every:
+            return np.zeros(0, np.int64)
+        return np.arange(0, self.frames, self.test_every)
+
+    def exposure(self) -> Exposure:
+        """All exposures; those of sharp frames have no length."""
+        opens = MARGIN_US + np.arange(self.frames, dtype=np.int64) * self.interval_us
+        closes = opens + self.exposure_us
+        middle = opens + self.exposure_us // 2
+        opens[self.test] = closes[self.test] = middle[self.test]
+        return Exposure(opens, closes)
+
+    def span_us(self) -> int:
+        """Length of the recording."""
+        return (self.frames - 1) * self.interval_us + self.exposure_us + 2 * MARGIN_US
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What records: the two sensors that share a lens."""
+
+    size: tuple[int, int] = (240, 160)
+    """Width and height in px, of both."""
+    frame_sensor: FrameSensor = field(default_factory=FrameSensor)
+    event_sensor: EventSensor = field(default_factory=EventSensor)
+
+    def camera(self) -> Camera:
+        """A pinhole camera with square pixels."""
+        width, height = self.size
+        focal = FOCAL_OF_WIDTH * width
+        return Camera(width, height, focal, focal, width / 2, height / 2)
+
+
+def simulate(
+    place: Scene | str = "garden",
+    path: Motion | str = "glide",
+    *,
+    rig: Rig = Rig(),
+    timing: Timing = Timing(),
+    seed: int = 0,
+) -> Capture:
+    """Record a scene with a moving camera.
+
+    Args:
+        place: A scene, or the name of one.
+        path: A camera path, or the name of one, which is then drawn from the seed.
+        rig: Sensors and their numbers.
+        timing: Frames, exposures and sampling.
+        seed: Of the path, the sensors' differences and their noise.
+
+    Returns:
+        A capture with everything known: the truth of blurry frames, poses every 5 ms, and in `notes`
+        the thresholds of each pixel.
+    """
+    place = scene(place) if isinstance(place, str) else place
+    path = motion(path, seed) if isinstance(path, str) else path
+    camera, clock, exposure = rig.camera(), Clock(0, timing.span_us()), timing.exposure()
+    pixels = EventPixels(rig.event_sensor, seed)
+    delay = rig.frame_sensor.row_delay_us
+    blurry = Exposing(exposure, rig.size, row_delay_us=delay)
+    middle = Exposure(exposure.middle_us, exposure.middle_us)
+    sharp = Exposing(middle, rig.size, row_delay_us=delay)
+    gaps = []
+    for t_us, rgb in pictures(place, path, camera, timing):
+        gaps.append(pixels.see(rgb, 1000 * t_us))
+        blurry.see(rgb, t_us)
+        sharp.see(rgb, t_us)
+    draw = numpy_generator(seed, 0, "frame noise")
+    frames = Frames(
+        images=store(blurry.means(), rig.frame_sensor, draw),
+        exposure=exposure,
+        track=np.zeros(timing.frames, np.int64),
+        names=tuple(f"{i:04d}" for i in range(timing.frames)),
+        encoding=rig.frame_sensor.encoding,
+        truth=store(sharp.means(), replace(rig.frame_sensor, full_well=0.0, read_noise=0.0), draw),
+        truth_known=np.ones(timing.frames, bool),
+    )
+    shown = pixels.pixels
+    width, height = rig.size
+    return Capture(
+        camera=camera,
+        trajectory=stamped(path, clock),
+        clock=clock,
+        near=place.near,
+        far=place.far,
+        frames=frames,
+        events=joined(gaps, rig.size, bayer=rig.event_sensor.bayer),
+        split=Split(np.setdiff1d(np.arange(timing.frames), timing.test), timing.test),
+        name=place.name,
+        source="simulation",
+        notes={
+            "threshold_on": rig.event_sensor.threshold_on,
+            "threshold_off": rig.event_sensor.threshold_off,
+            "threshold_on_map": shown.on.reshape(height, width).astype(np.float32),
+            "threshold_off_map": shown.off.reshape(height, width).astype(np.float32),
+            "refractory_us": rig.event_sensor.refractory_us,
+            "log_floor": rig.event_sensor.floor,
+            "row_delay_us": delay,
+        },
+    )
+
+
+def view(
+    place: Scene, camera: Camera, pose: Float64[np.ndarray, "3 4"], time_s: float = 0.0
+) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
+    """Linear light and depth (along the camera's axis) of all pixels.
+
+    Args:
+        place: The scene.
+        camera: The lens and sensor.
+        pose: World-from-camera.
+        time_s: Seconds, for scenes in which something moves.
+    """
+    across = _directions(camera) @ pose[:, :3].T
+    rgb, depth = place.light(pose[None, :, 3], across, time_s, footprint_rad=1 / camera.fx_px)
+    shape = camera.height, camera.width
+    return rgb.reshape(*shape, 3), depth.reshape(shape)
+
+
+def pictures(
+    place: Scene, path: Motion, camera: Camera, timing: Timing
+) -> Iterator[tuple[int, Float32[np.ndarray, "h w 3"]]]:
+    """Times in us and linear pictures over a whole recording, in the order of time."""
+    count = -(-timing.span_us() // timing.step_us)
+    instants = np.minimum(np.arange(count + 1) * timing.step_us, timing.span_us())
+
+    def draw(t_us: int) -> Float32[np.ndarray, "h w 3"]:
+        return view(place, camera, path.poses(np.array([t_us]))[0], 1e-6 * t_us)[0]
+
+    if timing.most_change:
+        yield from watch(draw, instants, most_change=timing.most_change)
+        return
+    with ThreadPoolExecutor(cpu_count()) as pool:
+        for first in range(0, len(instants), AHEAD):
+            part = instants[first : first + AHEAD]
+            yield from zip(part.tolist(), pool.map(draw, part.tolist()), strict=True)
+
+
+@lru_cache(maxsize=4)
+def _directions(camera: Camera) -> Float64[np.ndarray, "n 3"]:
+    """Directions seen by all pixels, with a z of 1, in camera axes."""
+    unit = camera.direction(camera.grid().double()).reshape(-1, 3).numpy()
+    return np.ascontiguousarray(unit / unit[:, 2:])
