@@ -1,0 +1,167 @@
+"""Step functions along a ray: where to look next, given where the light came from.
+
+Vocabulary: `depth [*b s]` are points of a ray in ascending order; `edges [*b s+1]` bound s
+intervals; `weights [*b s]` are the shares of the ray's light, see `ops.composite`. A *position* is
+a number 0 to 1 that says how far along the cumulative weight a new sample lies. New samples carry
+no gradient: they say where to look, and looking elsewhere is not how the light is explained.
+
+Sources: NeRF (ECCV 2020), section 5.2 for points; mip-NeRF 360 (CVPR 2022), sections 3 and 4 for
+intervals and the distortion loss.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+FLOOR = 1e-5
+"""Added to the weights before sampling, so that every part of a ray can be visited."""
+
+THINNEST = 1e-5
+"""Cumulative weight below which a bin is not divided by its own."""
+
+
+def random_positions(
+    leading: Sequence[int], count: int, generator: torch.Generator
+) -> Float[Tensor, "*b m"]:
+    """Independent uniform positions, unsorted: training of NeRF and its successors."""
+    return torch.rand(*leading, count, generator=generator, device=generator.device)
+
+
+def even_positions(
+    leading: Sequence[int], count: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "*b m"]:
+    """Evenly spaced positions from 0 to 1 inclusive: evaluation."""
+    return torch.linspace(0, 1, count, device=device).expand(*leading, count)
+
+
+def stratified_positions(
+    leading: Sequence[int], count: int, generator: torch.Generator
+) -> Float[Tensor, "*b m"]:
+    """One uniform position in each of `count` equal bins, ascending."""
+    start = torch.arange(count, device=generator.device)
+    return (start + random_positions(leading, count, generator)) / count
+
+
+def midpoints(depth: Float[Tensor, "*b s"]) -> Float[Tensor, "*b m"]:
+    """Half way between neighbours; m = s - 1."""
+    return (depth[..., 1:] + depth[..., :-1]) / 2
+
+
+def jitter(depth: Float[Tensor, "*b s"], amount: Float[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
+    """Move each point inside its own bin, which reaches half way to its neighbours.
+
+    The first and the last point have half a bin: nothing leaves the range of `depth`.
+
+    Args:
+        depth: Ascending.
+        amount: 0 to 1: where in its bin each point goes; `random_positions` in training.
+    """
+    middle = midpoints(depth)
+    lower = torch.cat([depth[..., :1], middle], -1)
+    upper = torch.cat([middle, depth[..., -1:]], -1)
+    return lower + (upper - lower) * amount
+
+
+@torch.no_grad()
+def invert(
+    edges: Float[Tensor, "*b e"],
+    weights: Float[Tensor, "*b s"],
+    position: Float[Tensor, "*b m"],
+) -> Float[Tensor, "*b m"]:
+    """Where the cumulative weight reaches each position; weight is spread evenly in an interval.
+
+    Args:
+        edges: Ascending; e = s + 1.
+        weights: At least one above zero on each ray; they need not sum to one.
+        position: 0 to 1.
+    """
+    share = weights / weights.sum(-1, keepdim=True)
+    total = torch.cat([torch.zeros_like(share[..., :1]), share.cumsum(-1)], -1).contiguous()
+    right = torch.searchsorted(total, position.contiguous(), right=True)
+    below, above = (right - 1).clamp(min=0), right.clamp(max=edges.shape[-1] - 1)
+    low, high = total.gather(-1, below), total.gather(-1, above)
+    start, end = edges.gather(-1, below), edges.gather(-1, above)
+    gap = high - low
+    gap = torch.where(gap < THINNEST, torch.ones_like(gap), gap)
+    return start + (position - low) / gap * (end - start)
+
+
+@torch.no_grad()
+def resample_points(
+    depth: Float[Tensor, "*b s"],
+    weights: Float[Tensor, "*b s"],
+    position: Float[Tensor, "*b m"],
+) -> Float[Tensor, "*b m"]:
+    """New points where the light came from; the bins lie between midpoints of the old points.
+
+    The first and the last weight belong to half bins and are left out, as in the released NeRF
+    and everything built on it.
+
+    Args:
+        depth: Ascending, at least three.
+        weights: Of those points.
+        position: From `random_positions` in training, `even_positions` in evaluation.
+    """
+    return invert(midpoints(depth), weights[..., 1:-1] + FLOOR, position)
+
+
+@torch.no_grad()
+def resample_intervals(
+    edges: Float[Tensor, "*b e"],
+    weights: Float[Tensor, "*b s"],
+    position: Float[Tensor, "*b m"],
+) -> Float[Tensor, "*b o"]:
+    """Edges of m new intervals whose middles lie where the light came from; o = m + 1.
+
+    Neighbouring intervals meet half way between their centres; the outermost edges mirror the
+    next ones about the outermost centres and stay inside the old range.
+
+    Args:
+        edges: Ascending; e = s + 1.
+        weights: Of the s intervals.
+        position: Ascending, at least two: `stratified_positions`, or their middles.
+    """
+    centre = invert(edges, weights + FLOOR, position)
+    inner = midpoints(centre)
+    first = (2 * centre[..., :1] - inner[..., :1]).maximum(edges[..., :1])
+    last = (2 * centre[..., -1:] - inner[..., -1:]).minimum(edges[..., -1:])
+    return torch.cat([first, inner, last], -1)
+
+
+@torch.no_grad()
+def merge(
+    first: Float[Tensor, "*b s"], second: Float[Tensor, "*b m"]
+) -> tuple[Float[Tensor, "*b t"], Int[Tensor, "*b t"]]:
+    """Both sets in ascending order, and where each came from in `cat([first, second])`.
+
+    The order lets a network see the samples unsorted; only its few outputs are then permuted
+    with `take_along`.
+    """
+    depth, order = torch.cat([first, second], -1).sort(dim=-1, stable=True)
+    return depth, order
+
+
+def take_along(value: Float[Tensor, "*b t c"], order: Int[Tensor, "*b t"]) -> Tensor:
+    """`value` with its samples in the given order."""
+    return value.gather(-2, order[..., None].expand_as(value))
+
+
+def distortion(edges: Float[Tensor, "*b e"], weights: Float[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
+    """How far the weight of a ray is spread: zero when it is all in one thin interval.
+
+    The mean distance of two points drawn from the step function, mip-NeRF 360 eq. 15, in linear
+    instead of quadratic time: with ascending middles m_i every pair i > j contributes
+    w_i w_j (m_i - m_j), so running sums of w and w m are enough.
+
+    Args:
+        edges: Ascending; e = s + 1; normalised distances, so that far away counts as near by.
+        weights: Of the s intervals.
+    """
+    middle = midpoints(edges)
+    before = weights.cumsum(-1) - weights
+    moment = (weights * middle).cumsum(-1) - weights * middle
+    between = 2 * (weights * (middle * before - moment)).sum(-1)
+    within = (weights.square() * edges.diff(dim=-1)).sum(-1) / 3
+    return between + within
