@@ -7,9 +7,9 @@ SAMPLES = Path(__file__).parents[1].parent / "shared" / "data"
 
 
 @pytest.fixture(scope="session", autouse=True)
-def two_threads() -> None:
-    """The tests measure themselves on two cores, wherever they run."""
-    torch.set_num_threads(min(2, torch.get_num_threads()))
+def one_thread() -> None:
+    """The tensors of tests are tiny: more threads would only wait for each other."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
