@@ -19,15 +19,12 @@ def linear(
     inputs: int, outputs: int, *, generator: torch.Generator, bias: bool = True
 ) -> nn.Linear:
     """A linear layer with PyTorch's default initialisation, drawn from `generator`."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, bias=bias)
-    for parameter in layer.parameters():
-        _fill(parameter, inputs, generator)
-    return layer
-
-
-def _fill(parameter: nn.Parameter, inputs: int, generator: torch.Generator) -> None:
+    layer = nn.Linear(inputs, outputs, bias=bias, device="meta")  # draws nothing
+    layer = layer.to_empty(device=generator.device)
     bound = 1 / math.sqrt(inputs)
-    nn.init.uniform_(parameter, -bound, bound, generator=generator)
+    for parameter in layer.parameters():
+        nn.init.uniform_(parameter, -bound, bound, generator=generator)
+    return layer
 
 
 class Dense(nn.Module):
@@ -71,14 +68,17 @@ class Dense(nn.Module):
                 hidden = self.activation(hidden)
             if index in self.skips:
                 hidden = torch.cat([x, hidden], -1)
-            hidden = _apply(layer, hidden)
+            assert isinstance(layer, nn.Linear)
+            hidden = _apply(layer.weight, layer.bias, hidden)
         return hidden
 
 
-def _apply(layer: nn.Linear, x: Float[Tensor, "*b i"]) -> Float[Tensor, "*b o"]:
-    """A layer in the precision of its input; its parameters stay as they are."""
-    bias = None if layer.bias is None else layer.bias.to(x.dtype)
-    return nn.functional.linear(x, layer.weight.to(x.dtype), bias)
+def _apply(
+    weight: Float[Tensor, "o i"], bias: Float[Tensor, "o"] | None, x: Float[Tensor, "*b i"]
+) -> Float[Tensor, "*b o"]:
+    """A linear layer in the precision of its input; its parameters stay as they are."""
+    bias = None if bias is None else bias.to(x.dtype)
+    return nn.functional.linear(x, weight.to(x.dtype), bias)
 
 
 class SplitLinear(nn.Module):
@@ -106,18 +106,16 @@ class SplitLinear(nn.Module):
     ) -> None:
         super().__init__()
         joined = linear(per_sample + per_ray, outputs, generator=generator, bias=bias)
-        of_sample, of_ray = joined.weight.detach().split([per_sample, per_ray], dim=1)
-        self.of_sample = nn.Parameter(of_sample.clone())
-        self.of_ray = nn.Parameter(of_ray.clone())
+        self.of_sample = nn.Parameter(joined.weight.detach()[:, :per_sample].clone())
+        self.of_ray = nn.Parameter(joined.weight.detach()[:, per_sample:].clone())
         self.bias = joined.bias
 
     def forward(
         self, sample: Float[Tensor, "*b s i"], ray: Float[Tensor, "*b j"]
     ) -> Float[Tensor, "*b s o"]:
         """W_sample sample + (W_ray ray + bias), the latter shared along a ray."""
-        bias = None if self.bias is None else self.bias.to(ray.dtype)
-        shared = nn.functional.linear(ray, self.of_ray.to(ray.dtype), bias)
-        return nn.functional.linear(sample, self.of_sample.to(sample.dtype)) + shared[..., None, :]
+        shared = _apply(self.of_ray, self.bias, ray)
+        return _apply(self.of_sample, None, sample) + shared[..., None, :]
 
 
 class FrameVectors(nn.Module):

@@ -63,9 +63,10 @@ def index_on_disk(events: EventStream, folder: Path, *, key: str, held: int = HE
 
 def site_ranges(offset: Int64[np.ndarray, "o"], held: int) -> list[tuple[int, int]]:
     """Consecutive ranges of sites with at most `held` events each, or with a single site."""
-    ranges, first, sites = [], 0, len(offset) - 1
+    ranges: list[tuple[int, int]] = []
+    first, sites = 0, len(offset) - 1
     while first < sites:
-        last = int(np.searchsorted(offset, offset[first] + held, side="right")) - 1
+        last = int(np.searchsorted(offset, int(offset[first]) + held, side="right")) - 1
         last = min(max(last, first + 1), sites)
         ranges.append((first, last))
         first = last

@@ -9,6 +9,7 @@ density_j delta_j is
 Only `e` and the weights are kept for it; plain torch keeps six arrays of that size.
 """
 
+from collections.abc import Callable
 from typing import Any, no_type_check
 
 import torch
@@ -24,7 +25,8 @@ from sharpfield.ops.composite import LEAK, weigh
 def _(
     density: Float[Tensor, "*b s"], delta: Float[Tensor, "*b s"], *, opaque_end: bool = False
 ) -> Float[Tensor, "*b s"]:
-    return _Weigh.apply(density, delta, opaque_end)
+    apply: Callable[..., Tensor] = _Weigh.apply  # pyright: ignore[reportUnknownMemberType]
+    return apply(density, delta, opaque_end)
 
 
 class _Weigh(torch.autograd.Function):
@@ -40,10 +42,12 @@ class _Weigh(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None]:
         density, delta, clear, weights = ctx.saved_tensors
         of_depth = torch.empty_like(clear)
-        _backward(_rows(clear), _rows(weights), _rows(gradient.contiguous()), _rows(of_depth))
+        _backward(_rows(clear), _rows(weights), _rows(gradients[0].contiguous()), _rows(of_depth))
         return (
             of_depth * delta if ctx.needs_input_grad[0] else None,
             of_depth * density if ctx.needs_input_grad[1] else None,
