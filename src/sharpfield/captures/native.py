@@ -23,6 +23,7 @@ from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
 from sharpfield.captures.event_files import open_events
 from sharpfield.captures.event_writer import write_events
+from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.native_frames import read_frames, write_frames
 from sharpfield.captures.native_trajectory import read_trajectory, write_trajectory
 from sharpfield.captures.toml_tables import Table, read_toml
@@ -41,24 +42,19 @@ NOTES = "notes.npz"
 NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
-def is_native(folder: Path) -> bool:
+def recognise(folder: Path) -> bool:
     """Whether a folder has our own layout."""
     return (folder / DESCRIPTION).is_file()
 
 
-def write_native(capture: Capture, folder: Path) -> None:
+def write(capture: Capture, folder: Path) -> None:
     """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
 
     Raises:
         CaptureError: The folder holds something that is not a capture, or the capture holds
             something the layout has no place for.
     """
-    if folder.exists() and not is_native(folder) and (folder.is_file() or any(folder.iterdir())):
-        raise CaptureError(
-            "will not replace a folder that is not a capture",
-            where=folder,
-            do=f"choose another place, or empty it (a capture has {DESCRIPTION})",
-        )
+    expect_replaceable(folder, recognise)
     arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
     with replacing_folder(folder) as fresh:
         about = {
@@ -85,7 +81,7 @@ def write_native(capture: Capture, folder: Path) -> None:
         (fresh / DESCRIPTION).write_text(tomli_w.dumps(about), encoding="utf-8")
 
 
-def read_native(folder: Path) -> Capture:
+def read(folder: Path) -> Capture:
     """Read a capture.
 
     Raises:

@@ -1,0 +1,40 @@
+"""From disk to captures, and from captures to what a training step looks at."""
+
+from sharpfield.captures.draw import (
+    PairTable,
+    PixelTable,
+    draw_chains,
+    draw_pairs,
+    draw_pixels,
+    draw_silent,
+    pair_table,
+    pixel_table,
+)
+from sharpfield.captures.event_cache import event_index, read_events
+from sharpfield.captures.event_files import EventFile, open_events
+from sharpfield.captures.event_writer import EventWriter, write_events, writing_events
+from sharpfield.captures.native import write
+from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read
+
+__all__ = [
+    "LAYOUTS",
+    "EventFile",
+    "EventWriter",
+    "Layout",
+    "PairTable",
+    "PixelTable",
+    "draw_chains",
+    "draw_pairs",
+    "draw_pixels",
+    "draw_silent",
+    "event_index",
+    "layout_of",
+    "open_events",
+    "pair_table",
+    "pixel_table",
+    "read",
+    "read_events",
+    "write",
+    "write_events",
+    "writing_events",
+]

@@ -1,0 +1,38 @@
+"""Rules by which published data sets hold out frames for testing.
+
+A rule is written `every:8` (frames 0, 8, 16, ...), `last:5` or `none`.
+"""
+
+import re
+
+import numpy as np
+
+from sharpfield.core.capture import Split
+from sharpfield.core.errors import CaptureError, OptionError
+
+RULE = re.compile(r"(?P<kind>every|last):(?P<number>[1-9][0-9]*)|none")
+
+
+def split_by_rule(count: int, rule: str) -> Split:
+    """Which of `count` frames are learned from, and which are held out.
+
+    Raises:
+        OptionError: The rule cannot be read.
+        CaptureError: It leaves nothing to learn from.
+    """
+    match = RULE.fullmatch(rule)
+    if match is None:
+        raise OptionError(
+            "unknown rule of what to hold out", got=rule, do="write every:8, last:5 or none"
+        )
+    every = np.arange(count, dtype=np.int64)
+    number = int(match["number"] or 0)
+    if match["kind"] == "every":
+        held_out = every % number == 0
+    else:
+        held_out = every >= count - number
+    if held_out.all():
+        raise CaptureError(
+            "no frame is left to learn from", got=f"{count} frames, hold-out rule {rule}"
+        )
+    return Split(train=every[~held_out], test=every[held_out])
