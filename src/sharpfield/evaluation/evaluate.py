@@ -1,0 +1,269 @@
+"""How good a trained model is: its views against pictures it has not seen, and sharp truth.
+
+`RUN/metrics.json` says under which protocol each number was measured; `RUN/renders/` holds the
+pictures. Pictures are compared in the display domain, as the frames store them.
+
+A render is made from the middle of a frame's exposure, in the model's own space. The capture that
+is compared with may hold more than the model was trained on (frames, say, for a model that saw
+only events), as long as both have the same clock.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.captures.images import write_image
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError, RunError
+from sharpfield.core.files import replacing
+from sharpfield.core.protocols import Model
+from sharpfield.evaluation.brightness import Brightness, fit_brightness
+from sharpfield.evaluation.pictures import colour_depth
+from sharpfield.evaluation.protocol import describe
+from sharpfield.evaluation.reference import Reference, held_out, trained_on
+from sharpfield.evaluation.scores import NAMES, mean, score
+from sharpfield.metrics import Lpips, laplacian_variance
+from sharpfield.metrics.lpips import SMALLEST_PX
+from sharpfield.rendering.view import CHUNK, Progress, render_view
+
+METRICS = "metrics.json"
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """How to measure."""
+
+    chunk: int = CHUNK
+    """Rays rendered at once."""
+    train_views: int | None = None
+    """Most training views with known truth to render, evenly spread; None for all."""
+    lpips: Lpips | None = None
+    """LPIPS with its weights, if the user has them."""
+    poses: Mapping[int, Float[Tensor, "3 4"]] = field(default_factory=dict)
+    """Poses to render frames from instead of the capture's, in the model's space."""
+    stated: Mapping[str, Any] = field(default_factory=dict)
+    """What the caller knows about the protocol: pose refinement, near-plane removal, ..."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A render beside what it should look like."""
+
+    reference: Reference
+    light: Float[Tensor, "h w c"]
+    """Linear, as the model gives it."""
+    depth: Float[Tensor, "h w"]
+    seconds: float
+
+
+def evaluate(
+    model: Model,
+    capture: Capture,
+    run: Path,
+    *,
+    measuring: Measuring | None = None,
+    baselines: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Measure a model on its held-out views and training views; write `metrics.json`.
+
+    Args:
+        model: Trained.
+        capture: What to compare with; on the same clock as the model's own capture.
+        run: Folder that gets `metrics.json` and `renders/`, and has `training.json`.
+        measuring: How.
+        baselines: Metrics of other methods to keep beside ours, by name: `{"mean": {...}}`, and
+            "run" with the folder of their renders, relative to `run`, for the report.
+        progress: Called with the number of pixels rendered, and the number of all.
+
+    Returns:
+        What was written.
+
+    Raises:
+        OptionError: The capture's frames have another size than the model's.
+        RunError: `training.json` is damaged, or the model renders numbers that are not finite.
+    """
+    how = measuring or Measuring()
+    _same_size(model, capture)
+    test, train = held_out(capture), trained_on(capture, limit=how.train_views)
+    shown = _Shown(progress, len(test) + len(train), model.capture.camera.size)
+    test_views = [_render(model, reference, capture, how, shown) for reference in test]
+    train_views = [_render(model, reference, capture, how, shown) for reference in train]
+
+    brightness = _brightness(model, test_views or train_views)
+    lpips = how.lpips if _large_enough(how.lpips, capture) else None
+    tested = [_judge(view, brightness, lpips, run / "renders" / "test") for view in test_views]
+    learned = [_judge(view, brightness, lpips, run / "renders" / "train") for view in train_views]
+    metrics: dict[str, Any] = {
+        "protocol": {
+            **describe(capture, test, lpips, too_small=how.lpips is not None and lpips is None),
+            "alignment": brightness.words(),
+            "compared_as": "luma" if brightness.grey else "all channels",
+            **how.stated,
+        },
+        "mean": mean(view for view in tested if view["reference"]),
+        "views": tested,
+        "train_views": _summary(learned, train_views, brightness, lpips),
+        "train": _training(run),
+    }
+    if baselines:
+        metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
+    with replacing(run / METRICS) as temporary:
+        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    return metrics
+
+
+class _Shown:
+    """Progress over several views."""
+
+    def __init__(self, progress: Progress | None, views: int, size: tuple[int, int]) -> None:
+        self.progress, self.pixels = progress, size[0] * size[1]
+        self.total, self.before = views * self.pixels, 0
+
+    def within(self, done: int, _: int) -> None:
+        """Called by the renderer of one view."""
+        if self.progress is not None:
+            self.progress(self.before + done, self.total)
+        self.before += self.pixels if done == self.pixels else 0
+
+
+def _render(
+    model: Model, reference: Reference, capture: Capture, how: Measuring, shown: _Shown
+) -> View:
+    frames, own = capture.needed_frames, model.capture
+    time = float(own.clock.unit(frames.exposure.middle_us)[reference.frame])
+    pose = how.poses.get(reference.frame)
+    if pose is None:
+        home = _device(own.trajectory)
+        track = torch.tensor(int(frames.track[reference.frame]), device=home)
+        pose = own.trajectory.pose(torch.tensor(time, device=home), track).detach()
+    begun = perf_counter()
+    seen = render_view(
+        model.render,
+        own.camera,
+        pose.to(_device(model)),
+        time,
+        chunk=how.chunk,
+        progress=shown.within,
+    )
+    if not seen.rgb.isfinite().all():
+        raise RunError(
+            "the model renders colours that are not finite numbers",
+            where=f"frame {reference.name}",
+            got=f"{int((~seen.rgb.isfinite()).sum())} of {seen.rgb.numel()} values",
+            do="train again, or evaluate an earlier checkpoint",
+        )
+    return View(reference, seen.rgb, seen.depth, perf_counter() - begun)
+
+
+def _brightness(model: Model, views: list[View]) -> Brightness:
+    """As the model develops light; for a model of events alone, aligned to the references."""
+    home = _device(model)
+
+    @torch.no_grad()
+    def develop(light: Tensor) -> Tensor:
+        return model.develop(light.to(home)).cpu()
+
+    events = model.capture.events
+    if model.capture.frames is not None or events is None:
+        return Brightness(develop)
+    compared = [
+        (view.light, view.reference.image) for view in views if view.reference.image is not None
+    ]
+    return fit_brightness(develop, compared, grey=not events.coloured)
+
+
+def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path) -> dict[str, Any]:
+    """Write the pictures of a view, and give its row of the metrics."""
+    reference = view.reference
+    picture = brightness.picture(view.light)
+    name = f"{reference.frame:04d}"
+    write_image(folder / f"{name}.png", _eight_bit(picture))
+    write_image(folder / f"{name}_depth.png", colour_depth(view.depth.numpy()))
+    row: dict[str, Any] = {
+        "name": reference.name,
+        "frame": reference.frame,
+        "reference": reference.kind or None,
+    }
+    if reference.image is None:
+        row |= dict.fromkeys(NAMES)
+    else:
+        row |= score(picture, brightness.reference(reference.image), lpips)
+    return row | {
+        "seconds": round(view.seconds, 3),
+        "image": f"renders/{folder.name}/{name}.png",
+        "depth": f"renders/{folder.name}/{name}_depth.png",
+    }
+
+
+def _summary(
+    rows: list[dict[str, Any]], views: list[View], brightness: Brightness, lpips: Lpips | None
+) -> dict[str, Any]:
+    """Means over training views with known truth, and how their blurred input scores there."""
+    inputs = []
+    for row, view in zip(rows, views, strict=True):
+        measured, truth = view.reference.measured, view.reference.image
+        measured = brightness.reference(measured)
+        row["sharpness"] = {
+            "result": float(laplacian_variance(brightness.picture(view.light))),
+            "input": float(laplacian_variance(measured)),
+        }
+        if truth is not None:
+            truth = brightness.reference(truth)
+            row["sharpness"]["truth"] = float(laplacian_variance(truth))
+            row["input"] = score(measured, truth, lpips)
+            inputs.append(row["input"])
+    return {
+        "count": len(inputs),
+        "mean": mean(row for row in rows if row["reference"]),
+        "input": {"mean": mean(inputs)},
+        "views": rows,
+    }
+
+
+def _training(run: Path) -> dict[str, Any]:
+    """What training wrote about its cost."""
+    path = run / "training.json"
+    cost: dict[str, Any] = dict.fromkeys(("steps", "seconds", "peak_memory_mb"))
+    if not path.is_file():
+        return cost
+    try:
+        written = json.loads(path.read_text())
+        return {name: written.get(name) for name in cost}
+    except (ValueError, AttributeError) as error:
+        raise RunError("cannot be read", where=path, got=error, do="train anew") from None
+
+
+def _same_size(model: Model, capture: Capture) -> None:
+    if capture.frames is not None and capture.camera.size != model.capture.camera.size:
+        raise OptionError(
+            "the model was trained at another image size",
+            where=capture.name,
+            got=f"frames {capture.camera.size}, model {model.capture.camera.size}",
+            do="evaluate on the capture it was trained on",
+        )
+
+
+def _large_enough(lpips: Lpips | None, capture: Capture) -> bool:
+    return lpips is not None and min(capture.camera.size) >= SMALLEST_PX[lpips.network]
+
+
+def _device(part: object) -> torch.device:
+    """Where a module's tensors are; the CPU if it is none, or has none."""
+    if not isinstance(part, nn.Module):
+        return torch.device("cpu")
+    held = next(chain(part.parameters(), part.buffers()), None)
+    return torch.device("cpu") if held is None else held.device
+
+
+def _eight_bit(picture: Float[Tensor, "h w c"]) -> np.ndarray:
+    return (picture * 255).round().to(torch.uint8).numpy()
