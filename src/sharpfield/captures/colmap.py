@@ -10,15 +10,15 @@ Intrinsics are scaled to the size of the images that are read. Depth bounds come
 from pathlib import Path
 
 from sharpfield.captures.colmap_model import Model, find_model, read_model
+from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import SUFFIXES, read_images
 from sharpfield.captures.photos import (
-    HELD_OUT_EVERY,
+    HOLD_OUT,
     Missing,
     Photos,
     choose_images,
     depth_bounds,
     existing,
-    hold_out_every,
     photo_capture,
     same_camera,
 )
@@ -40,7 +40,7 @@ def read(
     folder: Path,
     *,
     factor: int | None = None,
-    hold_out: int = HELD_OUT_EVERY,
+    hold_out: str = HOLD_OUT,
     bounds: tuple[float, float] | None = None,
     missing: Missing = "error",
     encoding: str = "srgb",
@@ -50,7 +50,7 @@ def read(
     Args:
         folder: Holds what the module describes.
         factor: Read `images_<factor>`; by default the smallest images there are.
-        hold_out: Hold out every so many photos for testing; 0 for none.
+        hold_out: Which photos to hold out, e.g. `every:8`, `last:5` or `none`.
         bounds: Nearest and farthest depth; by default what the points show.
         missing: What to do about photos of the model that are not there.
         encoding: How stored values relate to light.
@@ -74,7 +74,7 @@ def read(
     )
     return photo_capture(
         photos,
-        hold_out_every(len(kept), hold_out),
+        split_by_rule(len(kept), hold_out),
         bounds=bounds or depth_bounds(model.points, model.poses, model.seen, where=place),
         name=folder.resolve().name,
         source="colmap",

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from sharpfield.captures.colmap_model import find_model, read_model
+from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import (
-    HELD_OUT_EVERY,
+    HOLD_OUT,
     Photos,
     choose_images,
-    hold_out_every,
     photo_capture,
 )
 from sharpfield.captures.poses_bounds import PosesBounds, read_poses_bounds
@@ -46,7 +46,7 @@ def read(
     folder: Path,
     *,
     factor: int | None = None,
-    hold_out: int | None = None,
+    hold_out: str | None = None,
     encoding: str = "gamma2.2",
 ) -> Capture:
     """Read a scene.
@@ -55,7 +55,7 @@ def read(
         folder: Holds what the module describes.
         factor: Read `images_<factor>`; by default the smallest images there are, which is what
             the papers train on.
-        hold_out: Hold out every so many photos; by default what the marker file says, else 8.
+        hold_out: Which photos to hold out, e.g. `every:8`; by default as the marker file says.
         encoding: How stored values relate to light; the papers assume a gamma of 2.2.
 
     Raises:
@@ -82,7 +82,7 @@ def read(
     )
     return photo_capture(
         photos,
-        hold_out_every(len(paths), _hold_out(folder) if hold_out is None else hold_out),
+        split_by_rule(len(paths), hold_out or _hold_out(folder)),
         bounds=(float(table.bounds.min()), float(table.bounds.max())),
         name=folder.resolve().name,
         source="deblur-nerf",
@@ -90,8 +90,8 @@ def read(
     )
 
 
-def _hold_out(folder: Path) -> int:
-    markers = [m for p in folder.glob("hold=*") if (m := re.fullmatch(r"hold=(\d+)", p.name))]
+def _hold_out(folder: Path) -> str:
+    markers = [m for p in folder.glob("hold=*") if (m := re.fullmatch(r"hold=([1-9]\d*)", p.name))]
     if len(markers) > 1:
         raise CaptureError(
             "there must be at most one marker of what is held out",
@@ -99,7 +99,7 @@ def _hold_out(folder: Path) -> int:
             got=", ".join(sorted(m[0] for m in markers)),
             do="delete all but one",
         )
-    return int(markers[0][1]) if markers else HELD_OUT_EVERY
+    return f"every:{markers[0][1]}" if markers else HOLD_OUT
 
 
 def _points(folder: Path, table: PosesBounds) -> Float64[np.ndarray, "m 3"] | None:

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import read_images
-from sharpfield.captures.photos import Missing, Photos, existing, hold_out_every, photo_capture
+from sharpfield.captures.photos import HOLD_OUT, Missing, Photos, existing, photo_capture
 from sharpfield.captures.transforms import (
     frame_name,
     frames_of,
@@ -110,7 +111,7 @@ def _frames(path: Path, missing: Missing) -> list[dict[str, Any]]:
 
 def _split(counts: list[int]) -> Split:
     if len(counts) == 1:
-        return hold_out_every(counts[0])
+        return split_by_rule(counts[0], HOLD_OUT)
     train, test = counts
     return Split(
         train=np.arange(train, dtype=np.int64),

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import read_images
 from sharpfield.captures.photos import (
+    HOLD_OUT,
     Missing,
     Photos,
     existing,
-    hold_out_every,
     photo_capture,
     same_camera,
 )
@@ -142,7 +143,7 @@ def _split(content: dict[str, Any], names: list[str], path: Path) -> Split:
         for kind in ("train", "test", "val")
     }
     if not any(listed.values()):
-        return hold_out_every(len(names))
+        return split_by_rule(len(names), HOLD_OUT)
     test = listed["test"] or listed["val"]
     train = listed["train"] or set(names) - test
     known = np.array(names)

@@ -24,8 +24,8 @@ from sharpfield.geometry.trajectory import Still
 
 SECOND_US = 1_000_000
 
-HELD_OUT_EVERY = 8
-"""LLFF's rule: every 8th picture, beginning with the first, is held out for testing."""
+HOLD_OUT = "every:8"
+"""LLFF's rule of what to hold out, see `captures.hold_out`."""
 
 Missing = Literal["error", "skip"]
 """What to do about images that are named but not there."""
@@ -112,13 +112,6 @@ def choose_images(folder: Path, factor: int | None) -> Path:
             do="put them in images_<factor>/, or images/ for full size",
         )
     return found[max(found) if factor is None else factor]
-
-
-def hold_out_every(count: int, step: int = HELD_OUT_EVERY) -> Split:
-    """Hold out frames 0, step, 2 step, ... and learn from the others; step 0 holds out none."""
-    every = np.arange(count, dtype=np.int64)
-    held_out = every % step == 0 if step else np.zeros(count, bool)
-    return Split(train=every[~held_out], test=every[held_out])
 
 
 def existing(paths: Sequence[Path], *, missing: Missing, where: object) -> Int64[np.ndarray, "m"]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64
 
+from sharpfield.captures.arrays import load_array
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.trajectory import check_poses
 
@@ -42,7 +43,7 @@ def read_poses_bounds(path: Path) -> PosesBounds:
         CaptureError: The file is missing or malformed, holds non-finite numbers, a rotation that
             is not one, cameras that differ, or impossible depth bounds.
     """
-    rows = _load(path)
+    rows = load_array(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise CaptureError(
             "a pose table must have 17 columns", where=path, got=f"shape {rows.shape}"
@@ -68,12 +69,3 @@ def read_poses_bounds(path: Path) -> PosesBounds:
         )
     height, width, focal = intrinsics[0]
     return PosesBounds(poses, float(width), float(height), float(focal), bounds)
-
-
-def _load(path: Path) -> Shaped[np.ndarray, "..."]:
-    try:
-        return np.load(path, allow_pickle=False)
-    except FileNotFoundError:
-        raise CaptureError("pose table not found", where=path) from None
-    except (ValueError, EOFError, OSError) as error:
-        raise CaptureError("cannot read pose table", where=path, got=error) from None
