@@ -1,0 +1,45 @@
+"""The event sensor: the change of log intensity between two instants of a pixel.
+
+An event says that the log of the light at its pixel has changed by the contrast threshold since
+the pixel's previous event. So a pair of instants and the events between them measure a
+difference of two logarithms, which is the one formula with weights -1 and +1.
+
+Source: Ev-DeblurNeRF (CVPR 2024), event-by-event supervision; EventNeRF (CVPR 2023) for colour.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.measurements import EventPairs
+from sharpfield.core.protocols import Trajectory
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.formation.mix import mix
+from sharpfield.formation.response import Response
+from sharpfield.geometry.cast import cast
+
+
+@dataclass(frozen=True)
+class LogContrast:
+    """Predicted change of log intensity between the two times of each pair."""
+
+    camera: Camera
+    trajectory: Trajectory
+    response: Response
+    """Light to the logarithm of what the photoreceptor reports."""
+
+    def expose(self, seen: EventPairs) -> Rays:
+        """Rays `[b, 2]`: at the start with weight -1, at the end with weight +1."""
+        time = torch.stack([seen.start, seen.end], -1)
+        track = seen.track[:, None].expand_as(time)
+        weight = time.new_tensor([-1.0, 1.0]).expand_as(time)
+        pose = self.trajectory.pose(time, track)
+        return cast(self.camera, pose, seen.xy[:, None], time, weight)
+
+    def observe(self, radiance: Radiance, seen: EventPairs) -> Float[Tensor, "b 1"]:
+        """The change from start to end; natural log."""
+        return mix(radiance, inner=lambda light: self.response(light, seen))

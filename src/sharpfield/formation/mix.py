@@ -1,0 +1,37 @@
+"""The one formula: a measurement is a weighted sum of the sharp light along a few rays.
+
+    observed = outer( sum_k  w_k inner( L_k ) )
+
+`L_k` is the linear light along ray k and `w_k` the weight that rides with that ray. A sensor is
+then a way to choose rays and weights (*expose*) and two curves: `inner` acts on the light of each
+ray, `outer` on their sum.
+"""
+
+from collections.abc import Callable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.radiance import Radiance
+
+Curve = Callable[[Tensor], Tensor]
+"""Light in, something else out; one value at a time, or the channels of one ray at a time."""
+
+
+def identity(light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    """Light as it is."""
+    return light
+
+
+def mix(
+    radiance: Radiance, inner: Curve = identity, outer: Curve = identity
+) -> Float[Tensor, "*b c"]:
+    """What a sensor reports of the light along its rays.
+
+    Args:
+        radiance: Light of the rays `[*b, k]` that make each measurement, with their weights.
+        inner: Applied to the light of each ray.
+        outer: Applied to the weighted sum.
+    """
+    weight = radiance.weight[..., None]  # [*b, k, 1]
+    return outer((weight * inner(radiance.rgb)).sum(-2))
