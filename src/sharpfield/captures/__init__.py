@@ -15,6 +15,7 @@ from sharpfield.captures.event_files import EventFile, open_events
 from sharpfield.captures.event_writer import EventWriter, write_events, writing_events
 from sharpfield.captures.native import write
 from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read
+from sharpfield.captures.summary import capture_summary, summary
 
 __all__ = [
     "LAYOUTS",
@@ -23,6 +24,7 @@ __all__ = [
     "Layout",
     "PairTable",
     "PixelTable",
+    "capture_summary",
     "draw_chains",
     "draw_pairs",
     "draw_pixels",
@@ -34,6 +36,7 @@ __all__ = [
     "pixel_table",
     "read",
     "read_events",
+    "summary",
     "write",
     "write_events",
     "writing_events",

@@ -105,10 +105,10 @@ class EventFile:
         """
         width, height = self._needed_size()
         return EventStream(
-            x=coordinates(self._stored("x", first, last), "x", self.path),
-            y=coordinates(self._stored("y", first, last), "y", self.path),
+            x=coordinates(self.stored("x", first, last), "x", self.path),
+            y=coordinates(self.stored("y", first, last), "y", self.path),
             t_us=self._times(first, last),
-            p=polarity(self._stored("p", first, last), self.path),
+            p=polarity(self.stored("p", first, last), self.path),
             width=width,
             height=height,
             bayer=self.bayer,
@@ -173,26 +173,12 @@ class EventFile:
                 high = middle
         return low + int(np.searchsorted(self._times(low, high), time_us))
 
-    def _times(self, first: int, last: int) -> Int64[np.ndarray, "n"]:
-        if self.unit is None:
-            raise CaptureError(
-                "the file does not say the unit of its event times",
-                where=self.path,
-                got="datasets x, y, t, p at the root",
-                do="give the unit: ns, us, ms or s",
-            )
-        return whole_us(self._stored("t", first, last), self.unit, self.path) + self.offset_us
+    def stored(self, name: str, first: int, last: int) -> Stored:
+        """A part of a column as the file has it.
 
-    def _needed_size(self) -> tuple[int, int]:
-        if self.size is None:
-            raise CaptureError(
-                "the file does not say the size of its sensor",
-                where=self.path,
-                do="give width and height in pixels",
-            )
-        return self.size
-
-    def _stored(self, name: str, first: int, last: int) -> Stored:
+        Raises:
+            CaptureError: It cannot be read.
+        """
         try:
             return self.columns[name][first:last]
         except (OSError, EOFError, zipfile.BadZipFile) as error:
@@ -202,6 +188,25 @@ class EventFile:
                 got=error,
                 do="the file may be truncated: copy or convert it again",
             ) from None
+
+    def _times(self, first: int, last: int) -> Int64[np.ndarray, "n"]:
+        if self.unit is None:
+            raise CaptureError(
+                "the file does not say the unit of its event times",
+                where=self.path,
+                got="datasets x, y, t, p at the root",
+                do="give the unit: ns, us, ms or s",
+            )
+        return whole_us(self.stored("t", first, last), self.unit, self.path) + self.offset_us
+
+    def _needed_size(self) -> tuple[int, int]:
+        if self.size is None:
+            raise CaptureError(
+                "the file does not say the size of its sensor",
+                where=self.path,
+                do="give width and height in pixels",
+            )
+        return self.size
 
 
 def open_events(

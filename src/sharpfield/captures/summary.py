@@ -1,0 +1,184 @@
+"""What a capture or a file of events holds, in numbers; plain values, ready for JSON.
+
+A file is gone through a chunk at a time, so it need not fit in memory. Where a file does not say
+the unit of its times, times in us and rates are None and the stored ones are given instead.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from sharpfield.captures import llff_events
+from sharpfield.captures.event_columns import polarity
+from sharpfield.captures.event_files import CHUNK, EventFile, open_events
+from sharpfield.captures.read import read
+from sharpfield.core.capture import Capture
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Frames
+
+PATH_SAMPLES = 1000
+"""Instants at which the length of a trajectory is measured."""
+
+EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
+
+
+def summary(
+    path: Path, *, event_unit: str | None = None, layout: str | None = None
+) -> dict[str, Any]:
+    """What is at a path: a capture's folder, or a single file of events.
+
+    Args:
+        path: The folder or file.
+        event_unit: Unit of the event times (ns, us, ms, s), where the file does not say.
+        layout: Of the capture; by default it is recognised.
+
+    Raises:
+        CaptureError: It cannot be read.
+    """
+    if path.is_file() and path.suffix in EVENT_SUFFIXES:
+        with open_events(path, unit=event_unit) as file:
+            told = file if file.unit else replace(file, unit=_unit_of_layout(path))
+            return {"kind": "events", "name": path.name, "events": file_summary(told)}
+    return capture_summary(read(path, layout=layout, event_unit=event_unit))
+
+
+def capture_summary(capture: Capture) -> dict[str, Any]:
+    """What a capture holds."""
+    about: dict[str, Any] = {"kind": "capture", "name": capture.name, "layout": capture.source}
+    if capture.events is not None:
+        about["events"] = stream_summary(capture.events)
+    if capture.frames is not None:
+        about["frames"] = _frames_summary(capture.frames)
+        if capture.notes.get("motion") == "unknown":  # then exposures say nothing about blur
+            about["frames"] |= {"blurry": None, "sharp": None}
+        about["split"] = {
+            "train": len(capture.split.train),
+            "test": len(capture.split.test),
+            "test_frames": [capture.frames.names[i] for i in capture.split.test],
+        }
+    camera = capture.camera
+    about["camera"] = {
+        "width": camera.width,
+        "height": camera.height,
+        "focal_px": [camera.fx_px, camera.fy_px],
+        "centre_px": [camera.cx_px, camera.cy_px],
+        "lens": camera.lens,
+    }
+    about["trajectory"] = _trajectory_summary(capture)
+    about["bounds"] = {"near": capture.near, "far": capture.far}
+    about["clock"] = {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us}
+    about["points"] = 0 if capture.points is None else len(capture.points)
+    about["notes"] = {
+        key: f"array {note.shape}" if isinstance(note, np.ndarray) else note
+        for key, note in capture.notes.items()
+    }
+    return about
+
+
+def stream_summary(events: EventStream) -> dict[str, Any]:
+    """What a stream of events holds."""
+    brighter = sum(
+        int((events.p[first : first + CHUNK] > 0).sum()) for first in range(0, len(events), CHUNK)
+    )
+    span = (int(events.t_us[0]), int(events.t_us[-1])) if len(events) else None
+    return {
+        **_counts(len(events), brighter, span),
+        "width": events.width,
+        "height": events.height,
+        "rectified": events.rectified,
+        "coloured": events.coloured,
+    }
+
+
+def file_summary(file: EventFile) -> dict[str, Any]:
+    """What a file of events holds; all of it is read and checked, a chunk at a time.
+
+    Raises:
+        CaptureError: A part cannot be read, or the events are unsound.
+    """
+    brighter, largest = 0, [-1.0, -1.0]
+    for first in range(0, len(file), CHUNK):
+        last = min(first + CHUNK, len(file))
+        brighter += int((polarity(file.stored("p", first, last), file.path) > 0).sum())
+        for i, name in enumerate(("x", "y")):
+            largest[i] = max(largest[i], float(file.stored(name, first, last).max()))
+    span = file.span_us() if file.unit is not None and len(file) else None
+    # Without a stated size the sensor is at least as large as the largest coordinates say.
+    width, height = file.size or (max(int(x) + 1, 1) for x in largest)
+    replace(file, size=(width, height), unit=file.unit or "us").check()  # any unit shows the order
+    about = {
+        **_counts(len(file), brighter, span),
+        "width": width,
+        "height": height,
+        "size_from": "file" if file.size else "largest coordinates",
+        "unit": file.unit,
+    }
+    if file.unit is None and len(file):
+        ends = [file.stored("t", i, i + 1)[0].item() for i in (0, len(file) - 1)]
+        about |= {"t_first": ends[0], "t_last": ends[1]}
+    return about
+
+
+def _unit_of_layout(path: Path) -> str | None:
+    """The unit that an Ev-DeblurNeRF capture has, if the file is the events of one."""
+    folder = path.parent
+    if not (llff_events.recognise(folder) and path.name == "events.h5"):
+        return None
+    return llff_events.variant_of(folder).event_unit
+
+
+def _counts(count: int, brighter: int, span_us: tuple[int, int] | None) -> dict[str, Any]:
+    first, last = span_us or (None, None)
+    seconds = (span_us[1] - span_us[0]) / 1e6 if span_us else 0.0
+    return {
+        "count": count,
+        "on": brighter,
+        "off": count - brighter,
+        "t_first_us": first,
+        "t_last_us": last,
+        "duration_s": seconds if span_us else None,
+        "rate_per_s": count / seconds if seconds > 0 else None,
+    }
+
+
+def _frames_summary(frames: Frames) -> dict[str, Any]:
+    sharp = int(frames.exposure.instant.sum())
+    duration = frames.exposure.duration_us[~frames.exposure.instant]
+    known = frames.truth_known
+    with_truth = 0 if frames.truth is None else len(frames) if known is None else int(known.sum())
+    return {
+        "count": len(frames),
+        "blurry": len(frames) - sharp,
+        "sharp": sharp,
+        "width": frames.width,
+        "height": frames.height,
+        "channels": frames.channels,
+        "bits": 8 * frames.images.dtype.itemsize,
+        "encoding": frames.encoding,
+        "t_first_us": int(frames.exposure.open_us.min()),
+        "t_last_us": int(frames.exposure.close_us.max()),
+        "exposure_us": {
+            "least": int(duration.min()),
+            "median": int(np.median(duration)),
+            "most": int(duration.max()),
+        }
+        if len(duration)
+        else None,
+        "with_truth": with_truth,
+    }
+
+
+def _trajectory_summary(capture: Capture) -> dict[str, Any]:
+    """Tracks, when the first is known, and how long its path is."""
+    track = [0] if capture.frames is None else np.unique(capture.frames.track).tolist()
+    about: dict[str, Any] = {"kind": type(capture.trajectory).__name__, "tracks": len(track)}
+    known = capture.trajectory.known_us(0)
+    if known is None:
+        return about
+    instants = torch.linspace(*(float(capture.clock.unit(t)) for t in known), PATH_SAMPLES)
+    centres = capture.trajectory.pose(instants, torch.zeros(PATH_SAMPLES).long())[:, :, 3]
+    length = float(centres.diff(dim=0).norm(dim=-1).sum())
+    return about | {"t_first_us": known[0], "t_last_us": known[1], "path_length": length}
