@@ -88,6 +88,10 @@ class MLPField(nn.Module):
         """Nothing."""
         return torch.cat([old, new], -2)[..., :0]
 
-    def grids(self) -> list[nn.Parameter]:
+    def planes(self) -> list[nn.Parameter]:
+        """None."""
+        return []
+
+    def lines(self) -> list[nn.Parameter]:
         """None."""
         return []

@@ -177,6 +177,10 @@ class PlaneField(nn.Module):
         close = self.volumes[1](torch.cat([old, new], -2))
         return torch.cat([wide, close], -1)
 
-    def grids(self) -> list[nn.Parameter]:
-        """Planes and lines of both volumes: what total variation smooths."""
-        return [grid for volume in self.volumes for grid in (*volume.planes, *volume.lines)]
+    def planes(self) -> list[nn.Parameter]:
+        """Planes of both volumes."""
+        return [plane for volume in self.volumes for plane in volume.planes]
+
+    def lines(self) -> list[nn.Parameter]:
+        """Lines of both volumes."""
+        return [line for volume in self.volumes for line in volume.lines]

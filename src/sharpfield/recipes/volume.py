@@ -5,13 +5,17 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields import HeadSize, MLPField, PlaneField
 from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
+from sharpfield.losses.regularizers import smoothness
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
 
@@ -98,14 +102,28 @@ class Volume(nn.Module):
         """Where the parameters are."""
         return next(self.parameters()).device
 
-    def grids(self) -> list[nn.Parameter]:
-        """Planes and lines: a parameter group, and what total variation smooths."""
-        return self.field.grids()
+    @property
+    def feature_width(self) -> int:
+        """Width of the fine head's hidden features."""
+        return 256 if self.options.kind == "mlp" else self.options.fine[1]
 
-    def networks(self) -> list[nn.Parameter]:
-        """All other parameters of the field."""
-        grids = {id(grid) for grid in self.grids()}
-        return [p for p in self.field.parameters() if id(p) not in grids]
+    def sharp(self, rays: Rays, step: int, stream: str, *, samples: bool = False) -> Radiance:
+        """Light along rays while training: jittered and noisy, by seed, step and stream."""
+        made = generator(self.seed, step, stream, self.device)
+        return self.train_view(rays, made, samples=samples)
+
+    def smoothness(self) -> Tensor:
+        """Total variation of the planes and lines; zero without any."""
+        planes, lines = self.field.planes(), self.field.lines()
+        return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
+
+    def groups(self, rate: Schedule, *more: nn.Parameter) -> list[Group]:
+        """Parameters of grids and of networks, the latter with others that learn like them."""
+        grids = (*self.field.planes(), *self.field.lines())
+        known = {id(grid) for grid in grids}
+        networks = [p for p in self.field.parameters() if id(p) not in known]
+        groups = [Group("networks", (*networks, *more), rate)]
+        return [*groups, Group("grids", grids, rate)] if grids else groups
 
 
 def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space:

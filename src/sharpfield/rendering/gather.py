@@ -145,5 +145,5 @@ def _found(
     if not how.opaque_end:
         rgb = rgb + how.background * (1 - opacity)[..., None]
     return Found(
-        rgb, (weights * work.z).sum(-1), opacity, weights, hidden if keep_feature else None
+        rgb, (weights * work.z).sum(-1), opacity, weights, hidden.float() if keep_feature else None
     )
