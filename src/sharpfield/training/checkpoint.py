@@ -107,14 +107,12 @@ def load(path: Path) -> Checkpoint:
             got=f"{path.stat().st_size} bytes; {error}",
             do=START_AGAIN,
         ) from None
-    if header is None:
-        raise RunError("not a checkpoint of sharpfield", where=path, do="name a run's own folder")
-    written = json.loads(header)
-    if written["checksum"] != _checksum(tensors, written["progress"]):
+    checksum, progress = _unpacked(header, path)
+    if checksum != _checksum(tensors, dataclasses.asdict(progress)):
         raise RunError(
             "a checkpoint is damaged", where=path, got="a wrong checksum", do=START_AGAIN
         )
-    return Checkpoint(Progress(**written["progress"]), tensors)
+    return Checkpoint(progress, tensors)
 
 
 def recover(run: Path) -> tuple[Checkpoint | None, str]:
@@ -204,6 +202,17 @@ def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
             got="; ".join(changes[:4]),
             do="resume with the same options, or train anew into another folder",
         )
+
+
+def _unpacked(header: str | None, path: Path) -> tuple[str, Progress]:
+    """Checksum and progress of a file's header."""
+    try:
+        written = json.loads(header or "")
+        return written["checksum"], Progress(**written["progress"])
+    except (ValueError, TypeError, KeyError):
+        raise RunError(
+            "not a checkpoint of sharpfield", where=path, do="name a run's own folder"
+        ) from None
 
 
 def _write(path: Path, tensors: dict[str, Tensor], progress: Progress) -> None:

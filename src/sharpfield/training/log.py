@@ -2,7 +2,7 @@
 
 `log.csv` has one row per logged step: `step` (steps done), `seconds` (spent so far), `total`, then
 one column per loss term and per score, empty where there was none. A term that first appears later
-adds a column.
+adds a column; scores have rows of their own.
 """
 
 import csv
@@ -125,6 +125,10 @@ class Log:
             for name, value in values.items():
                 self.board.add_scalar(name, value, done)
 
+    def advance(self, done: int) -> None:
+        """Move the bar, without looking at any number."""
+        self.bar.update(self.task, completed=done)
+
     def show(self, done: int, values: Mapping[str, float]) -> None:
         """Say how far training is, how fast, and what the losses are."""
         now = time.monotonic()
@@ -132,7 +136,7 @@ class Log:
         self.pace = (done, now)
         terms = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         pace = f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / max(speed, 1e-9):.1f} s/step"
-        self.bar.update(self.task, completed=done, speed=pace, losses=terms)
+        self.bar.update(self.task, speed=pace, losses=terms)
         if not self.console.is_terminal and (now - self.spoken > QUIET_SECONDS or done == self.end):
             self.spoken = now
             left = math.ceil((self.end - done) / max(speed, 1e-9))
@@ -147,13 +151,13 @@ class LogLosses:
     """A hook that logs the mean of the losses over every `every` steps."""
 
     def __init__(self, log: Log, *, every: int) -> None:
-        """See the class."""
         self.log, self.every = log, every
         self.sums: dict[str, Tensor] = {}
         self.counts: dict[str, int] = {}
 
     def __call__(self, step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
         """Add the losses up, without waiting for the device; log when the time has come."""
+        self.log.advance(step + 1)
         for name, loss in losses.items():
             self.sums[name] = self.sums[name] + loss if name in self.sums else loss
             self.counts[name] = self.counts.get(name, 0) + 1

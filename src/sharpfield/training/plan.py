@@ -33,7 +33,7 @@ class Options:
     """Go on with the run in the folder, if there is one."""
     checkpoint_every: int | None = None
     """Steps between checkpoints; None for one a minute."""
-    log_every: int = 20
+    log_every: int = 10
     """Steps whose losses are averaged to one row of the log."""
     validate_every: int = 1000
     """Steps between validations, where there is something to validate with."""
