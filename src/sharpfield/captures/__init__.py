@@ -11,7 +11,8 @@ from sharpfield.captures.draw import (
     pixel_table,
 )
 from sharpfield.captures.event_cache import event_index, read_events
-from sharpfield.captures.event_files import EventFile, open_events
+from sharpfield.captures.event_file import EventFile
+from sharpfield.captures.event_layouts import open_events
 from sharpfield.captures.event_writer import EventWriter, write_events, writing_events
 from sharpfield.captures.native import write
 from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read

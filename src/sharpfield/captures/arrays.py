@@ -1,6 +1,7 @@
 """npy and npz files, loaded with a clear message when they are missing, cut off or pickled."""
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,11 @@ def load_arrays(path: Path) -> dict[str, Array]:
             return {name: loaded[name] for name in loaded.files}
         except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
             raise _unreadable(path, error) from None
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+    """Write an npz file."""
+    np.savez(path, allow_pickle=False, **arrays)
 
 
 def _load(path: Path) -> "Array | np.lib.npyio.NpzFile":

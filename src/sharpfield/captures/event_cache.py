@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.captures.event_files import EventFile
+from sharpfield.captures.event_file import EventFile
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.ops.event_index import EventIndex, build

@@ -18,7 +18,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sharpfield.captures.event_files import CHUNK, compression_plugin
+from sharpfield.captures.event_file import CHUNK
+from sharpfield.captures.event_layouts import compression_plugin
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
@@ -39,6 +40,7 @@ class EventWriter:
         self._count = 0
         self._offset_us = 0
         self._last_us: int | None = None
+        self._columns: dict[str, h5py.Dataset] = {}
         self._marks = file.create_dataset(
             "ms_to_idx", (0,), np.uint64, maxshape=(None,), chunks=(ROWS,), **_packing()
         )
@@ -71,7 +73,7 @@ class EventWriter:
             )
         columns = {"x": events.x, "y": events.y, "t": since, "p": (events.p > 0).astype(np.uint8)}
         for name, values in columns.items():
-            self._extend(self._file[f"events/{name}"], values)
+            self._extend(self._columns[name], values)
         known = len(self._marks)
         marks = np.arange(known, since[-1] // 1000 + 1)
         self._extend(self._marks, self._count + np.searchsorted(since, marks * 1000))
@@ -95,7 +97,7 @@ class EventWriter:
             "p": np.uint8,
         }
         for name, kind in kinds.items():
-            self._file.create_dataset(
+            self._columns[name] = self._file.create_dataset(
                 f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_packing()
             )
 

@@ -29,7 +29,7 @@ from sharpfield.captures.arrays import load_array, load_arrays
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
 from sharpfield.captures.event_columns import whole_us
-from sharpfield.captures.event_files import open_events
+from sharpfield.captures.event_layouts import open_events
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import choose_images

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from sharpfield.captures.arrays import load_array, load_arrays
+from sharpfield.captures.arrays import load_array, load_arrays, write_arrays
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.event_files import open_events
+from sharpfield.captures.event_layouts import open_events
 from sharpfield.captures.event_writer import write_events
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.native_frames import read_frames, write_frames
@@ -77,7 +77,7 @@ def write(capture: Capture, folder: Path) -> None:
         if capture.points is not None:
             np.save(fresh / POINTS, capture.points)
         if arrays:
-            np.savez(fresh / NOTES, **{f"note_{key}": array for key, array in arrays.items()})
+            write_arrays(fresh / NOTES, {f"note_{key}": array for key, array in arrays.items()})
         (fresh / DESCRIPTION).write_text(tomli_w.dumps(about), encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
-from sharpfield.captures.arrays import load_arrays
+from sharpfield.captures.arrays import load_arrays, write_arrays
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import CaptureError
@@ -25,6 +25,8 @@ from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import BSpline, Stamped, Still, Tracks
 
 FILE = "trajectory.npz"
+
+Storable = Stamped | Still | BSpline | Tracks
 
 Arrays = Mapping[str, Shaped[np.ndarray, "..."]]
 
@@ -36,7 +38,7 @@ def write_trajectory(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
         CaptureError: It is of another kind, for instance learned.
     """
     table, arrays = _packed(trajectory)
-    np.savez(folder / FILE, **arrays)
+    write_arrays(folder / FILE, arrays)
     return table
 
 
@@ -66,7 +68,7 @@ def _packed(trajectory: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                     "end_us": trajectory.end_us,
                 },
                 {
-                    "knots": trajectory.knots.numpy(),
+                    "knots": trajectory.get_buffer("knots").numpy(),
                     "twist": trajectory.twist.detach().numpy(),
                 },
             )
@@ -86,7 +88,7 @@ def _packed(trajectory: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     )
 
 
-def _unpacked(table: Table, arrays: Arrays, clock: Clock, *, prefix: str) -> Trajectory:
+def _unpacked(table: Table, arrays: Arrays, clock: Clock, *, prefix: str) -> Storable:
     def array(name: str) -> Shaped[np.ndarray, "..."]:
         if prefix + name not in arrays:
             raise CaptureError(

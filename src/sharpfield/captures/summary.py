@@ -13,7 +13,8 @@ import torch
 
 from sharpfield.captures import llff_events
 from sharpfield.captures.event_columns import polarity
-from sharpfield.captures.event_files import CHUNK, EventFile, open_events
+from sharpfield.captures.event_file import CHUNK, EventFile
+from sharpfield.captures.event_layouts import open_events
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
 from sharpfield.core.events import EventStream
@@ -178,7 +179,8 @@ def _trajectory_summary(capture: Capture) -> dict[str, Any]:
     known = capture.trajectory.known_us(0)
     if known is None:
         return about
-    instants = torch.linspace(*(float(capture.clock.unit(t)) for t in known), PATH_SAMPLES)
+    first, last = (float(capture.clock.unit(t)) for t in known)
+    instants = torch.linspace(first, last, PATH_SAMPLES)
     centres = capture.trajectory.pose(instants, torch.zeros(PATH_SAMPLES).long())[:, :, 3]
     length = float(centres.diff(dim=0).norm(dim=-1).sum())
     return about | {"t_first_us": known[0], "t_last_us": known[1], "path_length": length}

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64, Shaped
 
-from sharpfield.captures.event_files import CHUNK
+from sharpfield.captures.event_file import CHUNK
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import write_image
@@ -102,21 +102,17 @@ def _write_events(path: Path, events: EventStream, variant: Variant) -> None:
         kinds |= {"x": np.dtype(np.float32), "y": np.dtype(np.float32)}
     with h5py.File(path, "w") as file:
         file.attrs["tick_ns"] = 1000 // ticks
-        for name, kind in kinds.items():
-            file.create_dataset(
-                name,
-                (len(events),),
-                kind,
-                chunks=(min(ROWS, max(len(events), 1)),),
-                compression="gzip",
-                compression_opts=1,
-                shuffle=True,
-            )
+        rows = min(ROWS, max(len(events), 1))
+        packing = {"chunks": (rows,), "compression": "gzip", "shuffle": True}
+        columns = {
+            name: file.create_dataset(name, (len(events),), kind, **packing)
+            for name, kind in kinds.items()
+        }
         for first in range(0, len(events), CHUNK):
             part = slice(first, min(first + CHUNK, len(events)))
             chunk = events[part]
-            file["x"][part], file["y"][part] = chunk.x, chunk.y
-            file["t"][part], file["p"][part] = chunk.t_us * ticks, chunk.p > 0
+            columns["x"][part], columns["y"][part] = chunk.x, chunk.y
+            columns["t"][part], columns["p"][part] = chunk.t_us * ticks, chunk.p > 0
 
 
 def _stamps(capture: Capture) -> Stamps:

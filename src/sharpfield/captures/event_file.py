@@ -1,0 +1,178 @@
+"""A file of events that is open but not loaded: any window of time, any part, chunk by chunk."""
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Int64
+
+from sharpfield.captures.event_columns import Stored, coordinates, polarity, whole_us
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream, SiteColour, checked
+
+CHUNK = 2**20
+"""Events looked at together; bounds the memory of whatever goes through a file."""
+
+SEARCHED = 2**16
+"""Times unpacked at once when looking for one: an HDF5 chunk or so."""
+
+
+@runtime_checkable
+class Column(Protocol):
+    """A one-dimensional array that is read piece by piece."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, part: slice, /) -> Any: ...
+
+
+@dataclass(frozen=True)
+class EventFile:
+    """Events on disk. Close it, or use it in a `with` statement."""
+
+    path: Path
+    columns: Mapping[str, Column]
+    unit: str | None
+    """Of the stored times: ns, us, ms or s. None where neither the file nor the caller says."""
+    size: tuple[int, int] | None
+    """Width and height of the sensor in pixels; None where nobody says."""
+    offset_us: int = 0
+    """What stored times count from."""
+    ms_to_idx: Column | None = None
+    bayer: str = ""
+    site_colour: SiteColour | None = None
+    resources: ExitStack = field(default_factory=ExitStack)
+
+    def __enter__(self) -> "EventFile":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self.resources.close()
+
+    def __len__(self) -> int:
+        """Stored of events."""
+        return len(self.columns["t"])
+
+    def part(self, first: int, last: int) -> EventStream:
+        """Events number `first` to `last - 1`; their order is not checked.
+
+        Raises:
+            CaptureError: They cannot be read, or the unit or the size is not known.
+        """
+        width, height = self._needed_size()
+        return EventStream(
+            x=coordinates(self.stored("x", first, last), "x", self.path),
+            y=coordinates(self.stored("y", first, last), "y", self.path),
+            t_us=self._times(first, last),
+            p=polarity(self.stored("p", first, last), self.path),
+            width=width,
+            height=height,
+            bayer=self.bayer,
+            site_colour=self.site_colour,
+        )
+
+    def window(self, start_us: int, end_us: int) -> EventStream:
+        """Events with start <= t < end, found without reading the others."""
+        return self.part(self.first_at(start_us), self.first_at(end_us))
+
+    def chunks(self, first: int = 0, last: int | None = None) -> Iterator[EventStream]:
+        """Consecutive events, `CHUNK` at a time, checked one by one and against each other.
+
+        Raises:
+            CaptureError: See `core.events.checked`.
+        """
+        last = len(self) if last is None else last
+        before: int | None = None
+        for begin in range(first, last, CHUNK):
+            end = min(begin + CHUNK, last)
+            chunk = checked(self.part(begin, end), f"{self.path}, events {begin} to {end - 1}")
+            if before is not None and chunk.t_us[0] < before:
+                raise CaptureError(
+                    "event times are not ascending",
+                    where=self.path,
+                    got=f"event {begin - 1} at {before} us, event {begin} at {chunk.t_us[0]} us",
+                    do="sort the events by time (stable), and check that clock wraps were undone",
+                )
+            before = int(chunk.t_us[-1])
+            yield chunk
+
+    def check(self) -> None:
+        """Look at every event once, in bounded memory.
+
+        Raises:
+            CaptureError: See `core.events.checked`.
+        """
+        for _ in self.chunks():
+            pass
+
+    def span_us(self) -> tuple[int, int]:
+        """Times of the first and the last event; (0, 0) if there are none."""
+        if not len(self):
+            return 0, 0
+        return int(self._times(0, 1)[0]), int(self._times(len(self) - 1, len(self))[0])
+
+    def first_at(self, time_us: int) -> int:
+        """Stored of the first event at or after a time; the count of events if there is none."""
+        low, high = 0, len(self)
+        if self.ms_to_idx is not None and len(self.ms_to_idx):
+            ms = (time_us - self.offset_us) // 1000
+            marks = len(self.ms_to_idx)
+            if ms >= 0:
+                low = int(self.ms_to_idx[min(ms, marks - 1) : min(ms, marks - 1) + 1][0])
+            if ms + 1 < marks:
+                high = int(self.ms_to_idx[max(ms, -1) + 1 : max(ms, -1) + 2][0])
+        while high - low > SEARCHED:
+            middle = (low + high) // 2
+            if self._times(middle, middle + 1)[0] < time_us:
+                low = middle + 1
+            else:
+                high = middle
+        return low + int(np.searchsorted(self._times(low, high), time_us))
+
+    def stored(self, name: str, first: int, last: int) -> Stored:
+        """A part of a column as the file has it.
+
+        Raises:
+            CaptureError: It cannot be read.
+        """
+        try:
+            return self.columns[name][first:last]
+        except (OSError, EOFError, zipfile.BadZipFile) as error:
+            raise CaptureError(
+                "cannot read events",
+                where=f"{self.path}, column {name}, events {first} to {last - 1}",
+                got=error,
+                do="the file may be truncated: copy or convert it again",
+            ) from None
+
+    def _times(self, first: int, last: int) -> Int64[np.ndarray, "n"]:
+        if self.unit is None:
+            raise CaptureError(
+                "the file does not say the unit of its event times",
+                where=self.path,
+                do="give the unit: ns, us, ms or s",
+            )
+        return whole_us(self.stored("t", first, last), self.unit, self.path) + self.offset_us
+
+    def _needed_size(self) -> tuple[int, int]:
+        if self.size is None:
+            raise CaptureError(
+                "the file does not say the size of its sensor",
+                where=self.path,
+                do="give width and height in pixels",
+            )
+        return self.size

@@ -1,0 +1,184 @@
+"""Layouts of event files, recognised by what is inside.
+
+- DSEC: HDF5 with `events/{x, y, t, p}`, times in us after `t_offset`, and `ms_to_idx`, which
+  gives the first event at or after each millisecond.
+- Ours: a superset of it, written by `captures.event_writer`. Attributes give the sensor's size and
+  the unit; any tool that reads DSEC reads it.
+- Flat: HDF5 or npz with `x, y, t, p` at the root (EDS, Ev-DeblurNeRF, vid2e). It says neither
+  the unit of its times nor the size of the sensor, so the caller must.
+
+Source: Gehrig et al., *DSEC* (RA-L 2021), for the layout; the rest from files as published.
+"""
+
+import importlib
+import importlib.util
+import zipfile
+from collections.abc import Iterable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import h5py
+import numpy as np
+
+from sharpfield.captures.event_columns import ZippedColumn, known_unit, whole_us
+from sharpfield.captures.event_file import EventFile
+from sharpfield.core.errors import CaptureError, MissingExtra
+from sharpfield.core.events import SiteColour
+
+COLUMNS = ("x", "y", "t", "p")
+
+TICKS = {1: "ns", 1000: "us", 1_000_000: "ms"}
+"""Units of time by the attribute `tick_ns`."""
+
+BLOSC, PROPHESEE_ECF = 32001, 0x8ECF
+"""Numbers of HDF5 compression filters that need a plugin."""
+
+
+def open_events(
+    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
+) -> EventFile:
+    """Open a file of events.
+
+    Args:
+        path: An `.h5`, `.hdf5` or `.npz` file.
+        unit: Of the stored times (ns, us, ms, s), where the file does not say. What the file
+            says is overruled.
+        size: Width and height of the sensor, where the file does not say.
+
+    Raises:
+        CaptureError: The file is missing, truncated, or holds no events in a known layout.
+        MissingExtra: It is compressed by Blosc and the plugin is not installed.
+    """
+    if not path.is_file():
+        raise CaptureError("event file not found", where=path)
+    opened = _open_npz(path) if path.suffix == ".npz" else _open_hdf5(path)
+    counts = {name: len(column) for name, column in opened.columns.items()}
+    if len(set(counts.values())) != 1:
+        opened.close()
+        raise CaptureError(
+            "event columns have different lengths",
+            where=path,
+            got=", ".join(f"{name} {count}" for name, count in counts.items()),
+            do="the file may be truncated: copy or convert it again",
+        )
+    return replace(
+        opened,
+        unit=known_unit(unit) if unit else opened.unit,
+        size=size or opened.size,
+    )
+
+
+def _open_npz(path: Path) -> EventFile:
+    with ExitStack() as resources:
+        try:
+            archive = resources.enter_context(zipfile.ZipFile(path))
+            _expect_columns([name.removesuffix(".npy") for name in archive.namelist()], path)
+            columns = {name: ZippedColumn(archive, f"{name}.npy") for name in COLUMNS}
+        except (zipfile.BadZipFile, ValueError) as error:
+            raise CaptureError(
+                "not a readable npz file", where=path, got=error, do="copy or write it again"
+            ) from None
+        return EventFile(path, columns, unit=None, size=None, resources=resources.pop_all())
+    raise AssertionError("the block above returns or raises")
+
+
+def _open_hdf5(path: Path) -> EventFile:
+    compression_plugin()  # makes more compression filters known to HDF5
+    with ExitStack() as resources:
+        try:
+            file = resources.enter_context(h5py.File(path, "r"))
+        except OSError as error:
+            raise CaptureError(
+                "cannot open the event file: it is truncated, or not HDF5",
+                where=path,
+                got=f"{path.stat().st_size} bytes; {error}",
+                do="copy or convert it again",
+            ) from None
+        group = file.get("events")
+        grouped = isinstance(group, h5py.Group)
+        holder = group if grouped else file
+        _expect_columns(holder, path)
+        columns = {name: _column(holder, name, path) for name in COLUMNS}
+        tick = _whole(file, "tick_ns", 1000 if grouped else 0)
+        unit = TICKS.get(tick)
+        size = _whole(file, "width", 0), _whole(file, "height", 0)
+        return EventFile(
+            path,
+            columns,
+            unit=unit,
+            size=size if all(size) else None,
+            offset_us=_offset_us(file, unit or "us", path),
+            ms_to_idx=_column(file, "ms_to_idx", path)
+            if unit == "us" and "ms_to_idx" in file
+            else None,
+            bayer=str(file.attrs.get("bayer", "")),
+            site_colour=_site_colour(file, path),
+            resources=resources.pop_all(),
+        )
+    raise AssertionError("the block above returns or raises")
+
+
+def _whole(file: h5py.File, attribute: str, fallback: int) -> int:
+    return int(np.asarray(file.attrs.get(attribute, fallback)).item())
+
+
+def _offset_us(file: h5py.File, unit: str, path: Path) -> int:
+    stored = file.get("t_offset")
+    if not isinstance(stored, h5py.Dataset):
+        return 0
+    return int(whole_us(np.array(stored[()]).reshape(1), unit, path)[0])
+
+
+def compression_plugin() -> ModuleType | None:
+    """The package that reads and writes Blosc in HDF5, if it is installed."""
+    return importlib.import_module("hdf5plugin") if importlib.util.find_spec("hdf5plugin") else None
+
+
+def _site_colour(file: h5py.File, path: Path) -> SiteColour | None:
+    sites = file.get("site_colour")
+    if not isinstance(sites, h5py.Group):
+        return None
+    x, y, channel = (_column(sites, name, path)[:] for name in ("x", "y", "channel"))
+    return SiteColour(x, y, np.asarray(channel, np.int8))
+
+
+def _expect_columns(names: Iterable[str], path: Path) -> None:
+    found = sorted(names)
+    if set(COLUMNS) <= set(found):
+        return
+    raise CaptureError(
+        "no events in a known layout",
+        where=path,
+        got=f"holds {', '.join(found[:8]) or 'nothing'}",
+        do="use x, y, t, p at the root or in a group 'events'"
+        + ("; convert Prophesee's own HDF5 with their tools" if "CD" in found else ""),
+    )
+
+
+def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    column = group[name]
+    where = f"{path}, {column.name}"
+    if not isinstance(column, h5py.Dataset) or column.ndim != 1 or column.dtype.kind not in "iufb":
+        raise CaptureError(
+            "an event column must be a one-dimensional array of numbers", where=where, got=column
+        )
+    _expect_filters(column, where)
+    return column
+
+
+def _expect_filters(column: h5py.Dataset, where: str) -> None:
+    settings = column.id.get_create_plist()
+    for i in range(settings.get_nfilters()):
+        code = settings.get_filter(i)[0]
+        if h5py.h5z.filter_avail(code):
+            continue
+        if code == BLOSC:
+            raise MissingExtra("hdf5plugin", extra="io", purpose=f"reading {where}")
+        raise CaptureError(
+            "events are compressed in a way that cannot be read here",
+            where=where,
+            got="Prophesee's ECF" if code == PROPHESEE_ECF else f"HDF5 filter {code}",
+            do="convert the file with the maker's tools, to gzip or Blosc",
+        )
