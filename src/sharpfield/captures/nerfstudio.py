@@ -35,6 +35,7 @@ from sharpfield.captures.transforms import (
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
+from sharpfield.geometry.focus import focus
 
 LENSES = {
     "PINHOLE": ("pinhole", ()),
@@ -100,20 +101,17 @@ def read(
 
 
 def guessed_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
-    """Depth bounds from the point that all cameras look at.
+    """Depth bounds from the point that all cameras look at, and how far away it is.
 
-    The point is the nearest to all optical axes in the least-squares sense. Where the axes are
-    parallel there is none; then it is put at ten times the spread of the cameras.
+    Where the axes are parallel there is none; then it is put at ten times the spread of the
+    cameras.
     """
     centre, forward = poses[:, :, 3], poses[:, :, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    system = across.mean(0)
-    spread = float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0
-    depth = 10 * spread
-    if np.linalg.eigvalsh(system)[0] > 1e-3:
-        focus = np.linalg.solve(system, (across @ centre[..., None]).mean(0)[:, 0])
-        before = ((focus - centre) * forward).sum(-1)
-        depth = float(np.median(before)) if (before > 0).mean() > 0.5 else depth
+    target = focus(poses)
+    if target is not None:
+        depth = float(np.median(((target - centre) * forward).sum(-1)))
+    else:
+        depth = 10 * (float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0)
     return NEAR * depth, FAR * depth
 
 
