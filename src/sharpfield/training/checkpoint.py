@@ -130,7 +130,9 @@ def recover(run: Path) -> tuple[Checkpoint | None, str]:
     for leftover in (run / "checkpoints").glob(f".*{SUFFIX}"):
         leftover.unlink()
     last, previous = file_of(run, "last"), file_of(run, "previous")
-    if not last.exists() and not previous.exists():
+    if previous.exists() and not last.exists():
+        previous.replace(last)  # killed between the two moves of `save_last`
+    if not last.exists():
         return None, ""
     try:
         return load(last), ""
