@@ -1,12 +1,13 @@
 """Blurry frames: the mean of linear light while the shutter is open, as a sensor would store it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import ENCODINGS
 
 
 @dataclass(frozen=True)
@@ -25,12 +26,16 @@ class FrameSensor:
     """Each row opens and closes this much later than the one above: a rolling shutter."""
 
     def __post_init__(self) -> None:
-        if self.encoding not in ("gamma2.2", "srgb", "linear"):
+        if self.encoding not in ENCODINGS:
             raise OptionError(
-                "unknown response curve", got=self.encoding, do="use gamma2.2, srgb or linear"
+                "unknown response curve", got=self.encoding, do=f"use one of {', '.join(ENCODINGS)}"
             )
         if self.bits not in (8, 16):
             raise OptionError("a stored value has 8 or 16 bits", got=self.bits)
+
+    def noiseless(self) -> "FrameSensor":
+        """The same response and precision, without noise: how truth is stored."""
+        return replace(self, full_well=0.0, read_noise=0.0)
 
 
 class Exposing:
@@ -102,6 +107,18 @@ def encode(
     return np.where(light <= 0.0031308, 12.92 * light, bent).astype(np.float32)
 
 
+def decode(
+    display: Float32[np.ndarray, "*n h w c"], encoding: str
+) -> Float32[np.ndarray, "*n h w c"]:
+    """Linear light of display values: the inverse of `encode`."""
+    if encoding == "linear":
+        return display
+    if encoding == "gamma2.2":
+        return display ** np.float32(2.2)
+    bent = ((np.maximum(display, 0.04045) + 0.055) / 1.055) ** 2.4
+    return np.where(display <= 0.04045, display / 12.92, bent).astype(np.float32)
+
+
 def store(
     linear: Float32[np.ndarray, "*n h w c"], sensor: FrameSensor, draw: np.random.Generator
 ) -> UInt8[np.ndarray, "*n h w c"] | UInt16[np.ndarray, "*n h w c"]:
@@ -110,8 +127,7 @@ def store(
     if sensor.full_well:
         light = (draw.poisson(light * sensor.full_well) / sensor.full_well).astype(np.float32)
     if sensor.read_noise:
-        noise: Float64[np.ndarray, "..."] = draw.normal(0, sensor.read_noise, light.shape)
-        light = (light + noise).astype(np.float32)
+        light = light + draw.normal(0, sensor.read_noise, light.shape).astype(np.float32)
     white = 2**sensor.bits - 1
     stored = np.rint(encode(light, sensor.encoding) * white)
     return stored.astype(np.uint8 if sensor.bits == 8 else np.uint16)

@@ -108,9 +108,7 @@ def build(
     pages = np.zeros((max(len(sheets), 1), rows, columns), np.float32)
     for pane, sheet in zip(pages, sheets, strict=False):
         pane[: sheet.shape[0], : sheet.shape[1]] = sheet
-    shape = [
-        (p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow) for p in parts
-    ]
+    shape = [(p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow) for p in parts]
     look, which = [], 0
     for part in parts:
         paint, extent = part.paint, (0, 0, 0)

@@ -108,10 +108,8 @@ class Pixels(NamedTuple):
     off: Float64[np.ndarray, "n"]
     leak: Float64[np.ndarray, "n"]
     """Log units per ns."""
-    level: Float64[np.ndarray, "n"]
-    """What the comparator sees: log intensity, after the low-pass."""
     reference: Float64[np.ndarray, "n"]
-    """What it is compared with."""
+    """The level that the present one is compared with."""
     ready_ns: Int64[np.ndarray, "n"]
     """End of the dead time; before all time if there is none."""
     hazard: Float64[np.ndarray, "n"]
@@ -121,7 +119,7 @@ class Pixels(NamedTuple):
 
 
 def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int) -> Pixels:
-    """Draw a sensor's pixels, looking at light of a first `level`.
+    """Draw a sensor's pixels, looking at light of a first log `level`.
 
     What a pixel draws depends on the seed and its index alone.
     """
@@ -141,7 +139,6 @@ def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int)
         on=on,
         off=off,
         leak=leak,
-        level=level.copy(),
         reference=reference,
         ready_ns=np.full(n, np.iinfo(np.int64).min),
         hazard=draw.standard_exponential(n),

@@ -52,17 +52,19 @@ class EventPixels:
 
     def __init__(self, sensor: EventSensor, seed: int) -> None:
         self.sensor, self.seed = sensor, seed
+        dead_ns = round(1e3 * sensor.refractory_us)
+        resets = dead_ns > 0 and sensor.refractory_rule == "reset"
+        noisy = bool(sensor.leak_hz or sensor.shot_hz or sensor.hot_share)
+        self._rules = dead_ns, resets, noisy, sensor.leak_jitter, 1e-9 * sensor.shot_hz
         self.pixels = None
         self._size = (0, 0)
         self._last_ns = 0
-        self._target = np.zeros(0)
+        self._target = self._level = np.zeros(0)
         self._spikes = Spikes(
             np.empty(4096, np.int32), np.empty(4096, np.int32), np.empty(4096, np.int8)
         )
 
-    def see(
-        self, rgb: Float32[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w"], t_ns: int
-    ) -> Gap:
+    def see(self, rgb: Float32[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w"], t_ns: int) -> Gap:
         """Events since the last picture; none for the first.
 
         Args:
@@ -76,24 +78,31 @@ class EventPixels:
         target = log_intensity(light, self.sensor)
         if self.pixels is None:
             self.pixels = make_pixels(self.sensor, target, self.seed)
-            self._size, self._last_ns, self._target = light.shape, t_ns, target
+            self._size, self._last_ns = light.shape, t_ns
+            self._target = self._level = target
             return Gap(*(np.zeros(0, d) for d in (np.int16, np.int16, np.int64, np.int8)))
         if t_ns <= self._last_ns:
             raise OptionError(
                 "pictures must come in the order of time", got=f"{self._last_ns} ns, {t_ns} ns"
             )
         start_ns, self._last_ns = self._last_ns, t_ns
-        level = self._follow(target, light, t_ns - start_ns)
-        rules = (
-            round(1e3 * self.sensor.refractory_us),
-            self.sensor.refractory_rule == "reset",
-            self.sensor.leak_jitter,
-            1e-9 * self.sensor.shot_hz,
-        )
+        span_ns, before = (start_ns, t_ns), self._level
+        self._level = self._follow(target, light, t_ns - start_ns)
         count, self._spikes = _cross(
-            self.pixels, level, light.reshape(-1), (start_ns, t_ns), rules, self._spikes
+            self.pixels,
+            (before, self._level),
+            light.reshape(-1),
+            span_ns,
+            self._rules,
+            self._spikes,
         )
-        return _ordered(self._spikes, count, (start_ns, t_ns), self._size[1])
+        return _ordered(self._spikes, count, span_ns, self._size[1])
+
+    def thresholds(self) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
+        """Contrast thresholds of each pixel, ON and OFF; known once a picture was seen."""
+        assert self.pixels is not None, "thresholds are drawn when the first picture is seen"
+        on, off = self.pixels.on.reshape(self._size), self.pixels.off.reshape(self._size)
+        return on.astype(np.float32), off.astype(np.float32)
 
     def _follow(
         self, target: Float64[np.ndarray, "n"], light: Float32[np.ndarray, "h w"], gap_ns: int
@@ -105,7 +114,7 @@ class EventPixels:
         share = DARK_SPEED + (1 - DARK_SPEED) * np.clip(light.reshape(-1), 0, 1)
         gap = 2 * np.pi * self.sensor.cutoff_hz * share * (1e-9 * gap_ns)  # in time constants
         lag = (target - before) / gap
-        return target - lag + (self.pixels.level - before + lag) * np.exp(-gap)
+        return target - lag + (self._level - before + lag) * np.exp(-gap)
 
 
 def watch(
@@ -157,34 +166,35 @@ def joined(gaps: list[Gap], size: tuple[int, int], *, bayer: str = "") -> EventS
 
 @njit(cache=True)
 @no_type_check
-def _cross(pixels, level, light, span_ns, rules, spikes):
+def _cross(pixels, levels, light, span_ns, rules, spikes):
     """Let all pixels see a straight piece of log intensity; collect their events.
 
     Args:
         pixels: See `Pixels`; their memory is brought up to date.
-        level: Where each level ends.
+        levels: Where each level starts and ends.
         light: Linear intensity, which decides on shot noise.
         span_ns: Start and end.
-        rules: Dead time in ns, whether its end resets the reference, leak jitter, and the rate of
-            shot noise in the dark per ns.
+        rules: Dead time in ns, whether its end resets the reference, whether there is leak or shot
+            noise, leak jitter, and the rate of shot noise in the dark per ns.
         spikes: A buffer.
 
     Returns:
         Number of events, and the buffer (another one if it had to grow).
     """
-    t0, t1 = span_ns
-    dead, resets, jitter, shot = rules
+    (t0, t1), (before, after) = span_ns, levels
+    dead, resets, noisy, jitter, shot = rules
     duration, first_us, n = t1 - t0, (t0 + 500) // 1000, 0
     offset_us, pixel, polarity = spikes
-    for i in range(len(level)):
-        start, drift, reference = pixels.level[i], pixels.leak[i] * duration, pixels.reference[i]
+    for i in range(len(after)):
+        reference, on, off = pixels.reference[i], pixels.on[i], pixels.off[i]
+        if not (noisy or resets) and reference - off < after[i] < reference + on:
+            continue
+        start, drift, ready = before[i], pixels.leak[i] * duration, pixels.ready_ns[i]
         if jitter > 0.0 and drift > 0.0:
-            drift += jitter * sqrt(drift * pixels.on[i]) * _normal(pixels.random, i)
-        finish = level[i] + drift
+            drift += jitter * sqrt(drift * on) * _normal(pixels.random, i)
+        finish = after[i] + drift
         rate = shot * (1.0 - (1.0 - BRIGHT_SHOT) * min(light[i], 1.0))
         pixels.hazard[i] -= rate * duration
-        pixels.level[i] = level[i]
-        on, off, ready = pixels.on[i], pixels.off[i], pixels.ready_ns[i]
         if reference - off < finish < reference + on and pixels.hazard[i] > 0.0 and ready < t0:
             pixels.reference[i] = reference - drift
             continue

@@ -61,15 +61,15 @@ def stamped(path: Motion, clock: Clock) -> Stamped:
 
 
 def _glide(seed: int) -> Motion:
-    """An uneven loop about once a second, as of an arm that swings a camera."""
+    """An uneven loop of 0.8 s, as of an arm that swings a camera."""
     draw = numpy_generator(seed, 0, "motion")
     size = draw.uniform(0.9, 1.1, 6)
     start, turn = draw.uniform(0, 2 * np.pi), draw.choice([-1, 1])
-    loop = np.array([0.40, 0.26, 0.10, 0.012, 0.016, 0.008]) * size
-    wobble = np.array([0.07, 0.06, 0.03, 0.004, 0.004, 0.004]) * draw.uniform(0.8, 1.2, 6)
+    loop = np.array([0.40, 0.31, 0.10, 0.012, 0.016, 0.008]) * size
+    wobble = np.array([0.05, 0.05, 0.03, 0.003, 0.004, 0.004]) * draw.uniform(0.8, 1.2, 6)
     along = np.array([0, turn * np.pi / 2, 0.7, 1.1, 2.0, 0.3]) + start
     return Motion(
-        np.array([0.95, 2.3]),
+        np.array([1.25, 2.9]),
         np.stack([loop, wobble]),
         np.stack([along, draw.uniform(0, 2 * np.pi, 6)]),
     )

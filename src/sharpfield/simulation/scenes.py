@@ -78,7 +78,9 @@ def _garden() -> Parts:
             turn=FLAT,
             throws_shadow=False,
         ),
-        box((-1.9, 0.35, 6.1), (2.6, 1.8, 0.35), Paint("#b5573f", "#d98d62", "#e8dccb", BRICKS, 2.2)),
+        box(
+            (-1.9, 0.35, 6.1), (2.6, 1.8, 0.35), Paint("#b5573f", "#d98d62", "#e8dccb", BRICKS, 2.2)
+        ),
         box((0.2, 0.8, 4.6), (1.15, 0.9, 0.8), azulejo, turn=(0, 24, 0)),
         ball((0.2, 0.0, 4.6), 0.46, Paint("#2f7a3d", "#9fce5a", "#f0a7c0", LEAVES, 5.0, 8)),
         rectangle(
@@ -87,7 +89,11 @@ def _garden() -> Parts:
             Paint("#fff6e0", "#b0273a", text="SHARP\nFIELD"),
             turn=(0, -14, -4),
         ),
-        box((1.75, 0.55, 5.46), (0.09, 1.4, 0.09), Paint("#6b4a2f", "#8f6844", texture=WOOD, cells=4)),
+        box(
+            (1.75, 0.55, 5.46),
+            (0.09, 1.4, 0.09),
+            Paint("#6b4a2f", "#8f6844", texture=WOOD, cells=4),
+        ),
         ball((1.25, 0.87, 3.6), 0.38, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=6.0)),
         box(
             (-1.15, 0.83, 3.5),
@@ -103,7 +109,7 @@ def _garden() -> Parts:
             turn=(0, 10, 5),
         ),
     ]
-    return parts, 2.0, 9.0, 0.55
+    return parts, 2.0, 9.0, 0.45
 
 
 def _shelf() -> Parts:
@@ -132,14 +138,18 @@ def _shelf() -> Parts:
         left += width + 0.03
     parts += [
         ball((0.62, -0.72, 4.8), 0.53, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 2.4, 5)),
-        box((1.9, -0.66, 4.9), (0.9, 0.94, 0.5), Paint("#f3ead8", "#2456a6", "#d9822b", TILES, 4.4)),
+        box(
+            (1.9, -0.66, 4.9), (0.9, 0.94, 0.5), Paint("#f3ead8", "#2456a6", "#d9822b", TILES, 4.4)
+        ),
         box((-1.85, 0.87, 4.7), (1.2, 0.96, 0.7), Paint("#fbf3dc", "#1c1c2a", text="TEA\nNo. 7")),
         ball((-0.72, 0.97, 4.55), 0.38, Paint("#f5efe3", "#c8324a", texture=CHECKS, cells=6.5)),
-        box((0.35, 0.8, 4.7), (0.8, 1.1, 0.6), Paint("#efe9dc", "#2f6f6a", texture=STRIPES, cells=9)),
+        box(
+            (0.35, 0.8, 4.7), (0.8, 1.1, 0.6), Paint("#efe9dc", "#2f6f6a", texture=STRIPES, cells=9)
+        ),
         box((1.6, 0.95, 4.6), (1.15, 0.8, 0.7), Paint("#f4d06f", "#8f2d56", text="PLUM\nJAM")),
         ball((2.0, 0.98, 3.7), 0.3, Paint("#7fb069", "#e6aa68", "#fff1d0", LEAVES, 7.0, 9)),
     ]
-    return parts, 2.2, 7.5, 0.6
+    return parts, 2.2, 6.0, 0.45
 
 
 def _tiles() -> Parts:
@@ -162,7 +172,7 @@ def _tiles() -> Parts:
         ),
         ball((0.15, 0.62, 2.9), 0.3, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=7.0)),
     ]
-    return parts, 2.0, 8.0, 0.6
+    return parts, 2.0, 6.5, 0.55
 
 
 SCENES: dict[str, Callable[[], Parts]] = {"garden": _garden, "shelf": _shelf, "tiles": _tiles}

@@ -6,7 +6,7 @@ camera's motion, but every eighth a sharp view at the middle of its slot, held o
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from os import cpu_count
 
@@ -17,12 +17,11 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.core.exposure import Exposure
-from sharpfield.core.frames import Frames
-from sharpfield.core.seed import numpy_generator
-from sharpfield.simulation.blur import Exposing, FrameSensor, store
+from sharpfield.simulation.blur import FrameSensor
 from sharpfield.simulation.event_sensor import EventSensor
-from sharpfield.simulation.events import EventPixels, joined, watch
+from sharpfield.simulation.events import watch
 from sharpfield.simulation.motion import Motion, motion, stamped
+from sharpfield.simulation.recorder import Recorder
 from sharpfield.simulation.scenes import Scene, scene
 
 AHEAD = 32
@@ -98,12 +97,15 @@ class Rig:
         return Camera(width, height, focal, focal, width / 2, height / 2)
 
 
+STANDARD_RIG, STANDARD_TIMING = Rig(), Timing()
+
+
 def simulate(
     place: Scene | str = "garden",
     path: Motion | str = "glide",
     *,
-    rig: Rig = Rig(),
-    timing: Timing = Timing(),
+    rig: Rig = STANDARD_RIG,
+    timing: Timing = STANDARD_TIMING,
     seed: int = 0,
 ) -> Capture:
     """Record a scene with a moving camera.
@@ -116,54 +118,33 @@ def simulate(
         seed: Of the path, the sensors' differences and their noise.
 
     Returns:
-        A capture with everything known: the truth of blurry frames, poses every 5 ms, and in `notes`
-        the thresholds of each pixel.
+        A capture with everything known: the truth of blurry frames, poses every 5 ms, and in
+        `notes` the thresholds of each pixel.
     """
     place = scene(place) if isinstance(place, str) else place
     path = motion(path, seed) if isinstance(path, str) else path
     camera, clock, exposure = rig.camera(), Clock(0, timing.span_us()), timing.exposure()
-    pixels = EventPixels(rig.event_sensor, seed)
-    delay = rig.frame_sensor.row_delay_us
-    blurry = Exposing(exposure, rig.size, row_delay_us=delay)
-    middle = Exposure(exposure.middle_us, exposure.middle_us)
-    sharp = Exposing(middle, rig.size, row_delay_us=delay)
-    gaps = []
-    for t_us, rgb in pictures(place, path, camera, timing):
-        gaps.append(pixels.see(rgb, 1000 * t_us))
-        blurry.see(rgb, t_us)
-        sharp.see(rgb, t_us)
-    draw = numpy_generator(seed, 0, "frame noise")
-    frames = Frames(
-        images=store(blurry.means(), rig.frame_sensor, draw),
-        exposure=exposure,
-        track=np.zeros(timing.frames, np.int64),
-        names=tuple(f"{i:04d}" for i in range(timing.frames)),
-        encoding=rig.frame_sensor.encoding,
-        truth=store(sharp.means(), replace(rig.frame_sensor, full_well=0.0, read_noise=0.0), draw),
-        truth_known=np.ones(timing.frames, bool),
+    recorder = Recorder(
+        rig.size,
+        exposure,
+        frame_sensor=rig.frame_sensor,
+        event_sensor=rig.event_sensor,
+        seed=seed,
     )
-    shown = pixels.pixels
-    width, height = rig.size
+    for t_us, rgb in pictures(place, path, camera, timing):
+        recorder.see(rgb, t_us)
     return Capture(
         camera=camera,
         trajectory=stamped(path, clock),
         clock=clock,
         near=place.near,
         far=place.far,
-        frames=frames,
-        events=joined(gaps, rig.size, bayer=rig.event_sensor.bayer),
+        frames=recorder.frames(),
+        events=recorder.events(),
         split=Split(np.setdiff1d(np.arange(timing.frames), timing.test), timing.test),
         name=place.name,
         source="simulation",
-        notes={
-            "threshold_on": rig.event_sensor.threshold_on,
-            "threshold_off": rig.event_sensor.threshold_off,
-            "threshold_on_map": shown.on.reshape(height, width).astype(np.float32),
-            "threshold_off_map": shown.off.reshape(height, width).astype(np.float32),
-            "refractory_us": rig.event_sensor.refractory_us,
-            "log_floor": rig.event_sensor.floor,
-            "row_delay_us": delay,
-        },
+        notes=recorder.notes(),
     )
 
 

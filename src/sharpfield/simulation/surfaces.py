@@ -217,7 +217,7 @@ def _colour(surfaces, shape, i, ray, t, footprint):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _surface_point(shape, i, ray, t):
-    """Normal in the surface's axes, place on its texture, x and y in its axes, cosine to the ray."""
+    """Normal in the surface's axes; place on its texture; x, y in its axes; cosine to the ray."""
     x, y, z, dx, dy, dz = _within(shape, i, ray)
     x, y, z = x + t * dx, y + t * dy, z + t * dz
     nx, ny, nz, u, v = 0.0, 0.0, -1.0 if dz > 0 else 1.0, x, y
