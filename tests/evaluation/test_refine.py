@@ -110,12 +110,16 @@ def test_progress_is_told():
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
-def test_a_similarity_takes_measured_poses_to_the_space_of_the_model():
-    scene = capture()
+def elsewhere(scene):
+    """The scene in another world."""
     about, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     about *= np.sign(np.linalg.det(about))
-    change = Similarity(2.5, about, np.array([1.0, -2.0, 3.0]))
-    model = Sky(moved(scene, change))
+    return moved(scene, Similarity(2.5, about, np.array([1.0, -2.0, 3.0])))
+
+
+def test_a_similarity_takes_measured_poses_to_the_space_of_the_model():
+    scene = capture()
+    model = Sky(elsewhere(scene))
     found = aligned_poses(model, scene)
     for frame, expected in own_poses(model.capture).items():
         torch.testing.assert_close(found[frame], expected, atol=1e-4, rtol=0)
@@ -131,8 +135,9 @@ def on_a_slider():
 
 def test_cameras_on_a_line_fix_no_similarity():
     scene = on_a_slider()
-    found = aligned_poses(Sky(scene), scene)
-    for frame, expected in own_poses(scene).items():
+    model = Sky(elsewhere(scene))
+    found = aligned_poses(model, scene)
+    for frame, expected in own_poses(model.capture).items():
         torch.testing.assert_close(found[frame], expected)
 
 
