@@ -44,8 +44,11 @@ def load_arrays(path: Path) -> dict[str, Array]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
-    """Write an npz file."""
-    np.savez(path, allow_pickle=False, **arrays)
+    """Write an npz file; unlike `np.savez` it takes any name, also `file`."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _load(path: Path) -> "Array | np.lib.npyio.NpzFile":

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 
 from sharpfield.captures.arrays import load_array, load_arrays, write_arrays
 from sharpfield.captures.clocks import expect_overlap
@@ -26,7 +25,7 @@ from sharpfield.captures.event_writer import write_events
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.native_frames import read_frames, write_frames
 from sharpfield.captures.native_trajectory import read_trajectory, write_trajectory
-from sharpfield.captures.toml_tables import Table, read_toml
+from sharpfield.captures.toml_tables import Table, read_toml, toml_text
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError
@@ -67,18 +66,24 @@ def write(capture: Capture, folder: Path) -> None:
             "camera": _camera_table(capture.camera),
             "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
             "trajectory": write_trajectory(capture.trajectory, fresh),
-            "notes": {k: note for k, note in capture.notes.items() if k not in arrays},
+            "notes": {
+                k: note.item() if isinstance(note, np.generic) else note
+                for k, note in capture.notes.items()
+                if k not in arrays
+            },
         }
         if capture.frames is not None:
-            about["frames"] = {"encoding": capture.frames.encoding}
-            about["frame"] = write_frames(capture.frames, capture.split, fresh)
+            about["frames"] = {
+                "encoding": capture.frames.encoding,
+                "each": write_frames(capture.frames, capture.split, fresh),
+            }
         if capture.events is not None:
             write_events(fresh / EVENTS, capture.events)
         if capture.points is not None:
             np.save(fresh / POINTS, capture.points)
         if arrays:
-            write_arrays(fresh / NOTES, {f"note_{key}": array for key, array in arrays.items()})
-        (fresh / DESCRIPTION).write_text(tomli_w.dumps(about), encoding="utf-8")
+            write_arrays(fresh / NOTES, arrays)
+        (fresh / DESCRIPTION).write_text(toml_text(about), encoding="utf-8")
 
 
 def read(folder: Path) -> Capture:
@@ -91,19 +96,17 @@ def read(folder: Path) -> Capture:
     _expect_version(about)
     about.expect_only(
         *("format", "version", "name", "source", "near", "far", "camera", "clock"),
-        *("trajectory", "notes", "frames", "frame", "events"),
+        *("trajectory", "notes", "frames", "events"),
     )
     timing = about.table("clock")
     clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
     camera = _camera(about.table("camera"))
     frames, split = None, NO_SPLIT
-    if "frame" in about.values:
-        encoding = about.table("frames").text("encoding")
-        frames, split = read_frames(about.tables("frame"), folder, encoding=encoding)
+    if "frames" in about.values:
+        frames, split = read_frames(about.table("frames"), folder)
     notes = dict(about.table("notes", optional=True).values)
     if (folder / NOTES).exists():
-        stored = load_arrays(folder / NOTES)
-        notes |= {key.removeprefix("note_"): array for key, array in stored.items()}
+        notes |= load_arrays(folder / NOTES)
     return Capture(
         camera=camera,
         trajectory=read_trajectory(about.table("trajectory"), folder, clock),

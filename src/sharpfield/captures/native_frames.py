@@ -1,6 +1,6 @@
-"""Frames in our own layout: one `[[frame]]` table each, and PNG files in `frames/` and `truth/`.
+"""Frames in our own layout: a line each in `[frames] each`, and PNG files in `frames/`, `truth/`.
 
-A table gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
+A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
 "none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
 defaults in brackets.
 """
@@ -30,7 +30,7 @@ KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth")
 
 
 def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, Any]]:
-    """Write the images, and return the tables that describe the frames.
+    """Write the images, and return the lines that describe the frames.
 
     Raises:
         CaptureError: The truth is of another size or type than the images, or the split is not
@@ -63,12 +63,14 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
     return tables
 
 
-def read_frames(tables: Sequence[Table], folder: Path, *, encoding: str) -> tuple[Frames, Split]:
+def read_frames(about: Table, folder: Path) -> tuple[Frames, Split]:
     """Read what `write_frames` wrote.
 
     Raises:
-        CaptureError: A table or an image is missing or malformed, or images differ in size.
+        CaptureError: A line or an image is missing or malformed, or images differ in size.
     """
+    about.expect_only("encoding", "each")
+    tables = about.tables("each")
     for table in tables:
         table.expect_only(*KEYS)
     names = tuple(table.text("name") for table in tables)
@@ -82,7 +84,7 @@ def read_frames(tables: Sequence[Table], folder: Path, *, encoding: str) -> tupl
         ),
         track=_column([table.whole("track", 0) for table in tables]),
         names=names,
-        encoding=encoding,
+        encoding=about.text("encoding"),
         truth=truth,
         truth_known=known,
     )

@@ -1,0 +1,244 @@
+from dataclasses import fields, is_dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from sharpfield.captures import native
+from sharpfield.core import Camera, Capture, EventStream, SiteColour, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry.trajectory import BSpline, LearnedKnots, Stamped, Still, Tracks
+
+
+def differences(a, b, name="capture"):
+    """Names of the fields in which two captures differ in value or type."""
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        same = type(a) is type(b) and a.dtype == b.dtype and np.array_equal(a, b)
+        return [] if same else [name]
+    if is_dataclass(a) and type(a) is type(b):
+        return [
+            found
+            for field in fields(a)
+            for found in differences(getattr(a, field.name), getattr(b, field.name), field.name)
+        ]
+    if isinstance(a, dict) and isinstance(b, dict) and a.keys() == b.keys():
+        return [found for key in a for found in differences(a[key], b[key], f"{name}.{key}")]
+    if isinstance(a, torch.nn.Module) and type(a) is type(b):
+        one, other = dict(a.named_buffers()), dict(b.named_buffers())
+        one |= dict(a.named_parameters())
+        other |= dict(b.named_parameters())
+        return [key for key in one if not torch.equal(one[key], other[key])]
+    return [] if type(a) is type(b) and a == b else [name]
+
+
+def returned(capture, tmp_path):
+    native.write(capture, tmp_path / "capture")
+    return native.read(tmp_path / "capture")
+
+
+def test_a_capture_comes_back_exactly(tiny, tmp_path):
+    assert differences(returned(tiny, tmp_path), tiny) == []
+
+
+def still(count):
+    poses = np.tile(np.eye(3, 4), (count, 1, 1))
+    poses[:, :, 3] = np.random.default_rng(0).normal(size=(count, 3))
+    return poses
+
+
+def variations(tiny: Capture) -> dict[str, Capture]:
+    frames, events, clock = tiny.frames, tiny.events, tiny.clock
+    draw = np.random.default_rng(2)
+    known = draw.random(9) < 0.5
+    truth = np.where(known[:, None, None, None], 255 - frames.images, 0).astype(np.uint8)
+    deep = draw.integers(0, 65536, (9, 10, 12, 1)).astype(np.uint16)
+    sites = SiteColour(
+        draw.random(7).astype(np.float32), draw.random(7), np.int8([0, 1, 2] * 2 + [0])
+    )
+    rectified = EventStream(
+        (events.x + draw.random(5_000)).astype(np.float32),
+        (events.y - draw.random(5_000)).astype(np.float32),
+        events.t_us,
+        events.p,
+        12,
+        10,
+        site_colour=sites,
+    )
+    spline = BSpline(torch.from_numpy(still(6)), 0, 100_000, clock)
+    torch.nn.init.normal_(spline.twist, generator=torch.Generator().manual_seed(0))
+    moving = [tiny.trajectory, BSpline(torch.from_numpy(still(4)).float(), 0, 99_999, clock)]
+    lens = Camera(12, 10, 11.1, 1 / 3, 6.1, 5.2, "brown", (1e-17, -0.2, 0.1 + 0.2, 4.0, 5.0))
+    return {
+        "truth of some frames": replace(
+            tiny, frames=replace(frames, truth=truth, truth_known=known)
+        ),
+        "16-bit grey": replace(tiny, frames=replace(frames, images=deep, encoding="linear")),
+        "awkward names": replace(
+            tiny, frames=replace(frames, names=("a/b", "A", "a", "é", "", ".", "x\n", '"', "b"))
+        ),
+        "rectified colour events": replace(tiny, events=rectified),
+        "bayer": replace(tiny, events=replace(events, bayer="GRBG")),
+        "no events": tiny.without(events=True),
+        "no frames": replace(tiny, frames=None, split=Split(*[np.zeros(0, np.int64)] * 2)),
+        "lens": replace(tiny, camera=lens),
+        "line": replace(
+            tiny,
+            trajectory=Stamped(tiny.trajectory.times_us, tiny.trajectory.poses, clock, "linear"),
+        ),
+        "still": replace(
+            tiny,
+            frames=replace(frames, track=np.arange(9)),
+            trajectory=Still(still(9)),
+        ),
+        "spline": replace(tiny, trajectory=spline),
+        "tracks": replace(
+            tiny,
+            frames=replace(frames, track=np.array([0, 1, 2, 3, 4, 1, 0, 1, 4])),
+            trajectory=Tracks(moving, still(3)),
+        ),
+        "one moving track": replace(tiny, trajectory=Tracks(moving[:1], still(0))),
+        "points": replace(tiny, points=draw.normal(size=(5, 3))),
+        "frames in no part and in both": replace(
+            tiny, split=Split(np.array([1, 3]), np.array([3, 5]))
+        ),
+        "notes": replace(
+            tiny,
+            notes={
+                "threshold_on": 0.1 + 0.2,
+                "tiny": 5e-324,
+                "count": 3,
+                "file": np.arange(4, dtype=np.int16).reshape(2, 2),
+                "a word.with [dots]": 'quotes " and \\ and \n lines',
+            },
+        ),
+        "names": replace(tiny, name='ga"rden', source="simulation"),
+    }
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "truth of some frames",
+        "16-bit grey",
+        "awkward names",
+        "rectified colour events",
+        "bayer",
+        "no events",
+        "no frames",
+        "lens",
+        "line",
+        "still",
+        "spline",
+        "tracks",
+        "one moving track",
+        "points",
+        "frames in no part and in both",
+        "notes",
+        "names",
+    ],
+)
+def test_every_kind_of_capture_comes_back_exactly(tiny, tmp_path, kind):
+    capture = variations(tiny)[kind]
+    assert differences(capture, tiny), "the variation changes nothing"
+    assert differences(returned(capture, tmp_path), capture) == []
+
+
+def test_an_earlier_capture_is_replaced_whole(tiny, tmp_path):
+    native.write(replace(tiny, points=np.zeros((1, 3))), tmp_path / "capture")
+    native.write(tiny.without(events=True), tmp_path / "capture")
+    found = native.read(tmp_path / "capture")
+    assert found.points is None and found.events is None
+    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
+
+
+def test_anything_else_is_not_replaced(tiny, tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(CaptureError, match="will not replace what is not a capture"):
+        native.write(tiny, tmp_path)
+    with pytest.raises(CaptureError, match="will not replace"):
+        native.write(tiny, tmp_path / "thesis.tex")
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_a_write_that_fails_leaves_nothing(tiny, tmp_path):
+    learned = replace(tiny, trajectory=LearnedKnots(tiny.trajectory, knots=4))
+    with pytest.raises(CaptureError, match="cannot be written") as caught:
+        native.write(learned, tmp_path / "capture")
+    assert "LearnedKnots" in str(caught.value) and "Stamped(" in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_split_out_of_order_cannot_be_kept(tiny, tmp_path):
+    with pytest.raises(CaptureError, match="ascending order"):
+        native.write(replace(tiny, split=Split(np.array([3, 1]), np.array([0]))), tmp_path / "c")
+
+
+# What people write by hand
+
+
+def edited(tiny, tmp_path, old, new):
+    native.write(tiny, tmp_path / "capture")
+    path = tmp_path / "capture" / "capture.toml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    return native.read(tmp_path / "capture")
+
+
+def test_what_may_be_left_out(tiny, tmp_path):
+    found = edited(tiny, tmp_path, ', track = 0, use = "train"', "")
+    assert differences(found, tiny) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("version = 1", "version = 2", "sharpfield-capture version 2"),
+        ("fx_px = 11.0\n", "", "`fx_px` is missing"),
+        ("fx_px", "fx_pixels", "unknown key `fx_pixels`"),
+        ("near = 0.7", 'near = "close"', "`near` must be a number"),
+        ('use = "test"', 'use = "exam"', "write one of train, test, both, none"),
+        ('kind = "stamped"', 'kind = "drawn"', "use stamped, still, bspline or tracks"),
+        ('name = "01"', 'name = "09"', "image not found"),
+        ('name = "01"', 'name = "01", file = "../../01.png"', "outside the capture"),
+        ("open_us = 12000", "open_us = 22000", "an exposure ends before it begins"),
+        ("close_us = 20000", "close_us = 23000", "frames 1 and 2 overlap in time"),
+        ("close_us = 86000", "close_us = 860000", "poses do not cover 1 of 9 exposures"),
+        ("span_us = 100000", "span_us = 100", "event times look like ns"),
+    ],
+)
+def test_what_is_written_wrongly(tiny, tmp_path, old, new, message):
+    with pytest.raises(CaptureError) as caught:
+        edited(tiny, tmp_path, old, new)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("missing", "message"),
+    [("trajectory.npz", "file not found"), ("frames/03.png", "image not found")],
+)
+def test_a_missing_file_is_named(tiny, tmp_path, missing, message):
+    native.write(tiny, tmp_path)
+    (tmp_path / missing).unlink()
+    with pytest.raises(CaptureError, match=message) as caught:
+        native.read(tmp_path)
+    assert missing in str(caught.value)
+
+
+def test_events_of_another_tool_may_need_their_unit(tiny, tmp_path):
+    import h5py
+
+    native.write(tiny, tmp_path)
+    events = tiny.events
+    with h5py.File(tmp_path / "events.h5", "w") as file:
+        file["x"], file["y"], file["p"] = events.x, events.y, events.p
+        file["t"] = events.t_us * 1000
+    with pytest.raises(CaptureError, match="does not say the unit"):
+        native.read(tmp_path)
+    text = (tmp_path / "capture.toml").read_text()
+    (tmp_path / "capture.toml").write_text(text + '[events]\nunit = "us"\n')
+    with pytest.raises(CaptureError, match="event times look like ns") as caught:
+        native.read(tmp_path)
+    assert '[events] unit = "ns"' in str(caught.value)
+    (tmp_path / "capture.toml").write_text(text + '[events]\nunit = "ns"\n')
+    assert differences(native.read(tmp_path), tiny) == []
