@@ -1,8 +1,8 @@
 """One name per operation; the plain torch version defines the truth, others must match it.
 
-An *op* is a function of tensors with a *reference* in plain torch. `ops/fast/<file>.py` may register
-a *fast* version per device for the ops of `ops/<file>.py`; it is imported on the first call, so that
-importing the package compiles nothing. `SHARPFIELD_OPS` (or `using`) chooses:
+An *op* is a function of tensors with a *reference* in plain torch. `ops/fast/<file>.py` may
+register a *fast* version per device for the ops of `ops/<file>.py`; it is imported on the first
+call, so that importing the package compiles nothing. `SHARPFIELD_OPS` (or `using`) chooses:
 
 - `auto`: the fast version where there is one for the device, else the reference;
 - `reference`: always the reference;
@@ -30,7 +30,7 @@ Example = Callable[[torch.Generator, int], tuple[Any, ...]]
 
 CHOICES = ("auto", "reference", "fast")
 
-_choice = contextvars.ContextVar("ops", default=os.environ.get("SHARPFIELD_OPS", "auto"))
+_choice = contextvars.ContextVar("ops", default=str(os.environ.get("SHARPFIELD_OPS", "auto")))
 _ops: "dict[str, Op[..., Any]]" = {}
 
 
@@ -126,7 +126,7 @@ def registered() -> "dict[str, Op[..., Any]]":
 
 
 def versions() -> dict[str, str]:
-    """Which version each op ran so far, e.g. `{"grid.plane_line_features": "fast (cpu, numba)"}`."""
+    """Which version each op ran so far, e.g. `{"composite.weigh": "fast (cpu, numba)"}`."""
     return {name: ", ".join(sorted(op.used)) for name, op in registered().items() if op.used}
 
 

@@ -106,3 +106,29 @@ def plane_line_mixture(
         basis: A column of weights per mixed feature; the transpose of a linear layer's weight.
     """
     return plane_line_features.reference(points, planes, lines) @ basis
+
+
+def _example_volume(
+    generator: torch.Generator, size: int
+) -> tuple[Float[Tensor, "n 3"], list[Float[Tensor, "_ _ _"]], list[Float[Tensor, "_ _"]]]:
+    """Points in a box and a little outside, and a volume of 9, 7 and 11 cells times `size`."""
+    x, y, z = 9 * size, 7 * size, 11 * size
+    xy, xz, yz = 32, 16, 16
+
+    def values(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator)
+
+    points = 2.4 * torch.rand(40 * size**2, 3, generator=generator) - 1.2
+    planes = [values(y, x, xy), values(z, x, xz), values(z, y, yz)]
+    return points, planes, [values(z, xy), values(y, xz), values(x, yz)]
+
+
+@plane_line_features.exemplify
+def _features_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
+    return _example_volume(generator, size)
+
+
+@plane_line_mixture.exemplify
+def _mixture_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
+    points, planes, lines = _example_volume(generator, size)
+    return points, planes, lines, torch.randn(64, 8, generator=generator)

@@ -1,0 +1,131 @@
+"""Plane and line lookups on the CPU.
+
+Points are worked through in chunks whose taps and features stay in the processor's cache, so that
+mixing them costs no trip to memory. Nothing is kept for the backward pass but the arguments.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sharpfield.ops.fast import _grid_kernels as kernels
+from sharpfield.ops.fast._kernel import memory, spread
+from sharpfield.ops.fast._lanes import lanes_for
+from sharpfield.ops.grid import PAIRS, plane_line_features, plane_line_mixture
+
+CHUNK = 8192
+"""Points at a time: 3 MB of 96 features."""
+
+
+@plane_line_features.accelerate("cpu", needs="numba")
+def _(
+    points: Float[Tensor, "*b 3"],
+    planes: Sequence[Float[Tensor, "_ _ _"]],
+    lines: Sequence[Float[Tensor, "_ _"]],
+) -> Float[Tensor, "*b f"]:
+    return _look_up(points, None, planes, lines)
+
+
+@plane_line_mixture.accelerate("cpu", needs="numba")
+def _(
+    points: Float[Tensor, "*b 3"],
+    planes: Sequence[Float[Tensor, "_ _ _"]],
+    lines: Sequence[Float[Tensor, "_ _"]],
+    basis: Float[Tensor, "f m"],
+) -> Float[Tensor, "*b m"]:
+    return _look_up(points, basis.contiguous(), planes, lines)
+
+
+def _look_up(
+    points: Tensor, basis: Tensor | None, planes: Sequence[Tensor], lines: Sequence[Tensor]
+) -> Tensor:
+    grids = [grid.contiguous() for grid in (*planes, *lines)]
+    found = _Lookup.apply(points.reshape(-1, 3).contiguous(), basis, *grids)
+    return found.reshape(*points.shape[:-1], -1)
+
+
+class _Lookup(torch.autograd.Function):
+    """Features of a volume, mixed by a basis if there is one."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, basis: Tensor | None, *grids: Tensor) -> Tensor:
+        ctx.save_for_backward(points, basis, *grids)
+        volume = _volume(grids)
+        features = sum(plane.shape[2] for plane in volume.planes)
+        out = points.new_empty(len(points), features if basis is None else basis.shape[1])
+        tile = points.new_empty(CHUNK, features)
+        for rows, taps in _chunks(points, volume):
+            if basis is None:
+                spread(kernels.gather, taps, volume, memory(out[rows]))
+            else:
+                part = tile[: rows.stop - rows.start]
+                spread(kernels.gather, taps, volume, memory(part))
+                torch.mm(part, basis, out=out[rows])
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        points, basis, *grids = ctx.saved_tensors
+        needs_points, needs_basis, *needs_grids = ctx.needs_input_grad
+        grad, volume = gradients[0].contiguous(), _volume(grids)
+        of_grids = _GridGradients(volume) if any(needs_grids) else None
+        of_points = torch.zeros_like(points) if needs_points else None
+        of_basis = torch.zeros_like(basis) if needs_basis else None
+        tile = points.new_empty(CHUNK, grad.shape[1] if basis is None else len(basis))
+        for rows, taps in _chunks(points, volume):
+            arrived, part = grad[rows], tile[: rows.stop - rows.start]
+            if of_basis is not None:
+                spread(kernels.gather, taps, volume, memory(part))
+                of_basis.addmm_(part.T, arrived)
+            if basis is not None:
+                arrived = torch.mm(arrived, basis.T, out=part)
+            if of_grids is not None:
+                spread(kernels.scatter, taps, volume, of_grids.arrays, memory(arrived))
+            if of_points is not None:
+                spread(kernels.slope, taps, volume, memory(arrived), memory(of_points[rows]))
+        tables = of_grids.tensors() if of_grids else [None] * len(grids)
+        return of_points, of_basis, *tables
+
+
+def _volume(grids: Sequence[Tensor]) -> kernels.Volume:
+    """Three planes and three lines as kernels see them."""
+    views = [memory(grid) for grid in grids]
+    lanes = lanes_for(*(view.shape[-1] for view in views))
+    return kernels.Volume(np.array(PAIRS), tuple(views[:3]), tuple(views[3:]), lanes)
+
+
+def _chunks(points: Tensor, volume: kernels.Volume) -> Iterator[tuple[slice, kernels.Taps]]:
+    """Walk through the points: which ones, and their taps."""
+    shape = np.array([len(line) for line in reversed(volume.lines)])
+    for start in range(0, len(points), CHUNK):
+        rows = slice(start, min(start + CHUNK, len(points)))
+        some = memory(points[rows])
+        size = (len(some), 3, 2)
+        weights, slopes = np.empty(size, some.dtype), np.empty(size, some.dtype)
+        taps = kernels.Taps(np.empty(size, np.intp), weights, slopes)
+        spread(kernels.locate, some, shape, taps)
+        yield rows, taps
+
+
+class _GridGradients:
+    """Gradients of planes and lines, filled chunk by chunk.
+
+    Numpy allocates them because it asks for huge pages, which are several times faster to fill.
+    """
+
+    def __init__(self, volume: kernels.Volume) -> None:
+        planes = tuple(np.zeros_like(plane) for plane in volume.planes)
+        bands = kernels.BANDS
+        lines = tuple(np.zeros((bands, *line.shape), line.dtype) for line in volume.lines)
+        self.arrays = planes, lines
+
+    def tensors(self) -> list[Tensor]:
+        """The gradients, planes first."""
+        planes, lines = self.arrays
+        return [torch.from_numpy(grad) for grad in (*planes, *(bands.sum(0) for bands in lines))]
