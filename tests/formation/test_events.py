@@ -2,8 +2,15 @@ import pytest
 import torch
 
 from sharpfield.core import Formation
-from sharpfield.formation import FixedResponse, LogContrast, gamma
-from tests.formation.toy import CAMERA, lit, pairs, swaying, wall
+from sharpfield.formation import (
+    ChainedContrast,
+    FixedResponse,
+    LearnedResponse,
+    LogContrast,
+    gamma,
+    mix,
+)
+from tests.formation.toy import CAMERA, chains, lit, pairs, swaying, wall
 
 
 def sensor(**options) -> LogContrast:
@@ -75,3 +82,31 @@ def test_black_and_equal_times_stay_finite():
 def test_no_pairs():
     rays = sensor().expose(pairs(0))
     assert rays.shape == (0, 2) and sensor().observe(wall(rays), pairs(0)).shape == (0, 1)
+
+
+@pytest.mark.parametrize("bayer", [False, True])
+def test_a_chain_is_its_pairs(bayer):
+    """Also where the response reads each pair's own counts."""
+    seen = chains(bayer=bayer)
+    response = LearnedResponse(polarity_start="random", steps=20)
+    one_by_one = LogContrast(CAMERA, swaying(), response)
+    chained, flat = ChainedContrast(one_by_one), seen.reshape(-1)
+    rays = chained.expose(seen)
+    assert rays.shape == (5, 5)
+    torch.testing.assert_close(
+        chained.observe(wall(rays), seen), one_by_one.observe(wall(one_by_one.expose(flat)), flat)
+    )
+
+
+def test_the_weights_of_a_chain_give_its_whole_change():
+    seen, chained = chains(), ChainedContrast(sensor())
+    light = wall(chained.expose(seen))
+    whole = mix(light, inner=lambda rgb: sensor().response(rgb, seen[:, 0]))
+    torch.testing.assert_close(chained.observe(light, seen).view(5, 4).sum(1, keepdim=True), whole)
+
+
+def test_a_chain_of_one_is_a_pair():
+    seen = chains(length=1)
+    rays, flat = ChainedContrast(sensor()).expose(seen), sensor().expose(seen[:, 0])
+    for name in ("origin", "direction", "time", "weight"):
+        torch.testing.assert_close(getattr(rays, name), getattr(flat, name))

@@ -73,3 +73,24 @@ def pairs(count: int = 7, *, bayer: bool = False) -> EventPairs:
         positive=sign.clamp(min=0),
         channel=torch.randint(3, (count,), generator=made) if bayer else None,
     )
+
+
+def chains(count: int = 5, *, length: int = 4, bayer: bool = False) -> EventPairs:
+    """Runs `[count, length]` of pairs, each beginning where the one before it ended."""
+    made = generator(0, 0, "toy chains")
+    first = pairs(count, bayer=bayer)
+    ends = (0.5 * torch.rand(count, length + 1, generator=made)).cumsum(1) / length
+    sign = 2.0 * torch.randint(2, (count, length), generator=made) - 1
+
+    def along(x: Tensor) -> Tensor:
+        return x[:, None].expand(count, length, *x.shape[1:])
+
+    return EventPairs(
+        xy=along(first.xy),
+        track=along(first.track),
+        start=ends[:, :-1],
+        end=ends[:, 1:],
+        negative=sign.clamp(max=0),
+        positive=sign.clamp(min=0),
+        channel=None if first.channel is None else along(first.channel),
+    )

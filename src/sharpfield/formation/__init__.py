@@ -1,7 +1,7 @@
 """From a measurement to the sharp rays behind it, and from their light to what is reported."""
 
 from sharpfield.formation.adaptive import AdaptiveWeights
-from sharpfield.formation.events import LogContrast
+from sharpfield.formation.events import ChainedContrast, LogContrast
 from sharpfield.formation.mix import Curve, identity, mix
 from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual, Response
 from sharpfield.formation.rigid_kernel import ORIGIN, RigidKernel, RigidMotions
@@ -15,6 +15,7 @@ __all__ = [
     "TONES",
     "AdaptiveWeights",
     "Bend",
+    "ChainedContrast",
     "Curve",
     "FixedResponse",
     "FixedThresholds",
