@@ -47,6 +47,8 @@ from sharpfield.geometry.trajectory import Stamped, Tracks
 
 LAYOUT = "ev-deblur-nerf"
 
+TRAJECTORY = ("all_poses_bounds.npy", "all_timestamps.npy")
+
 OFF_TRAJECTORY_PX = 1.0
 """A frame whose own pose would move the nearest things by more than this in the image, against
 the trajectory at its time, was not taken on the trajectory."""
@@ -75,8 +77,9 @@ COLOR_DAVIS = Variant("us", "linear", "last:5", 0.25, "trajectory")
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has this layout: a pose table and events."""
-    return (folder / "poses_bounds.npy").is_file() and (folder / "events.h5").is_file()
+    """Whether a folder has this layout: a trajectory's files, or a pose table and events."""
+    named = [(folder / name).is_file() for name in ("poses_bounds.npy", "events.h5")]
+    return all(named) or any((folder / name).is_file() for name in TRAJECTORY)
 
 
 def variant_of(folder: Path) -> Variant:
@@ -153,7 +156,16 @@ def _exposure(path: Path) -> Exposure:
 
 
 def _trajectory(folder: Path) -> tuple[PosesBounds, Stamped]:
-    poses_file, times_file = folder / "all_poses_bounds.npy", folder / "all_timestamps.npy"
+    poses_file, times_file = (folder / name for name in TRAJECTORY)
+    for path in (poses_file, times_file):
+        if not path.is_file():
+            raise CaptureError(
+                "poses over time are missing",
+                where=path,
+                got="poses of single frames only",
+                do="give a pose at least every few ms, over all exposures and events;"
+                " one pose per frame does not say how the camera moved between",
+            )
     table = read_poses_bounds(poses_file)
     times_us = whole_us(load_array(times_file), "us", times_file)
     _expect_one_each(f"{poses_file} and {times_file.name}", poses=len(table), times=len(times_us))

@@ -37,7 +37,7 @@ LAYOUTS: dict[str, Layout] = {
     "ev-deblur-nerf": Layout(
         llff_events.recognise,
         llff_events.read,
-        "poses_bounds.npy and events.h5",
+        "poses_bounds.npy, all_poses_bounds.npy and events.h5",
         options=("event_unit",),
     ),
     "deblur-nerf": Layout(deblur_nerf.recognise, deblur_nerf.read, "poses_bounds.npy and images*/"),

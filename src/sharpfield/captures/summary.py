@@ -179,7 +179,7 @@ def _trajectory_summary(capture: Capture) -> dict[str, Any]:
     known = capture.trajectory.known_us(0)
     if known is None:
         return about
-    first, last = (float(capture.clock.unit(t)) for t in known)
+    first, last = capture.clock.unit(np.array(known)).tolist()
     instants = torch.linspace(first, last, PATH_SAMPLES)
     centres = capture.trajectory.pose(instants, torch.zeros(PATH_SAMPLES).long())[:, :, 3]
     length = float(centres.diff(dim=0).norm(dim=-1).sum())
