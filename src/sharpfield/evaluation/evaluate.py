@@ -11,15 +11,13 @@ only events), as long as both have the same clock.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from sharpfield.captures.images import write_image
 from sharpfield.core.capture import Capture
@@ -27,7 +25,8 @@ from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
-from sharpfield.evaluation.pictures import colour_depth
+from sharpfield.evaluation.device import device_of
+from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.reference import Reference, held_out, trained_on
 from sharpfield.evaluation.scores import NAMES, mean, score
@@ -50,6 +49,8 @@ class Measuring:
     """LPIPS with its weights, if the user has them."""
     poses: Mapping[int, Float[Tensor, "3 4"]] = field(default_factory=dict)
     """Poses to render frames from instead of the capture's, in the model's space."""
+    events_only: bool | None = None
+    """Whether the model knows no absolute brightness; None: if its capture has no frames."""
     stated: Mapping[str, Any] = field(default_factory=dict)
     """What the caller knows about the protocol: pose refinement, near-plane removal, ..."""
 
@@ -99,7 +100,7 @@ def evaluate(
     test_views = [_render(model, reference, capture, how, shown) for reference in test]
     train_views = [_render(model, reference, capture, how, shown) for reference in train]
 
-    brightness = _brightness(model, test_views or train_views)
+    brightness = _brightness(model, test_views or train_views, how)
     lpips = how.lpips if _large_enough(how.lpips, capture) else None
     tested = [_judge(view, brightness, lpips, run / "renders" / "test") for view in test_views]
     learned = [_judge(view, brightness, lpips, run / "renders" / "train") for view in train_views]
@@ -143,14 +144,14 @@ def _render(
     time = float(own.clock.unit(frames.exposure.middle_us)[reference.frame])
     pose = how.poses.get(reference.frame)
     if pose is None:
-        home = _device(own.trajectory)
+        home = device_of(own.trajectory)
         track = torch.tensor(int(frames.track[reference.frame]), device=home)
         pose = own.trajectory.pose(torch.tensor(time, device=home), track).detach()
     begun = perf_counter()
     seen = render_view(
         model.render,
         own.camera,
-        pose.to(_device(model)),
+        pose.to(device_of(model)),
         time,
         chunk=how.chunk,
         progress=shown.within,
@@ -165,16 +166,17 @@ def _render(
     return View(reference, seen.rgb, seen.depth, perf_counter() - begun)
 
 
-def _brightness(model: Model, views: list[View]) -> Brightness:
+def _brightness(model: Model, views: list[View], how: Measuring) -> Brightness:
     """As the model develops light; for a model of events alone, aligned to the references."""
-    home = _device(model)
+    home = device_of(model)
 
     @torch.no_grad()
     def develop(light: Tensor) -> Tensor:
         return model.develop(light.to(home)).cpu()
 
     events = model.capture.events
-    if model.capture.frames is not None or events is None:
+    blind = model.capture.frames is None if how.events_only is None else how.events_only
+    if not blind or events is None:
         return Brightness(develop)
     compared = [
         (view.light, view.reference.image) for view in views if view.reference.image is not None
@@ -187,7 +189,7 @@ def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path
     reference = view.reference
     picture = brightness.picture(view.light)
     name = f"{reference.frame:04d}"
-    write_image(folder / f"{name}.png", _eight_bit(picture))
+    write_image(folder / f"{name}.png", eight_bit(picture.numpy()))
     write_image(folder / f"{name}_depth.png", colour_depth(view.depth.numpy()))
     row: dict[str, Any] = {
         "name": reference.name,
@@ -255,15 +257,3 @@ def _same_size(model: Model, capture: Capture) -> None:
 
 def _large_enough(lpips: Lpips | None, capture: Capture) -> bool:
     return lpips is not None and min(capture.camera.size) >= SMALLEST_PX[lpips.network]
-
-
-def _device(part: object) -> torch.device:
-    """Where a module's tensors are; the CPU if it is none, or has none."""
-    if not isinstance(part, nn.Module):
-        return torch.device("cpu")
-    held = next(chain(part.parameters(), part.buffers()), None)
-    return torch.device("cpu") if held is None else held.device
-
-
-def _eight_bit(picture: Float[Tensor, "h w c"]) -> np.ndarray:
-    return (picture * 255).round().to(torch.uint8).numpy()

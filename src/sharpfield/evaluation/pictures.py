@@ -12,6 +12,7 @@ Colours = UInt8[np.ndarray, "h w 3"]
 ERROR_WHITE = 0.25
 """Mean absolute error over the channels that gets the brightest colour."""
 
+FULL = 90
 RED, BLUE, WHITE = (200, 32, 38), (38, 86, 190), (255, 255, 255)
 
 
@@ -32,17 +33,22 @@ def colour_error(
 def event_picture(events: EventStream, start_us: int, end_us: int) -> Colours:
     """Events of a time window on white: red where more got brighter, blue where more got darker.
 
-    The colour is full where the sum of signs reaches its 99th percentile.
+    The colour is full where the sum of signs reaches its 90th percentile.
     """
     part = events.window(start_us, end_us)
     xy = np.stack([part.x, part.y], -1).astype(np.float32)
     sign = np.asarray(part.p, np.float64)[:, None]
     total = splat_nearest(xy, sign, width=events.width, height=events.height)
     busy = np.abs(total[total != 0])
-    strength = np.clip(total / (np.percentile(busy, 99) if len(busy) else 1), -1, 1)
+    strength = np.clip(total / (np.percentile(busy, FULL) if len(busy) else 1), -1, 1)
     colour = np.where(strength > 0, np.array(RED), np.array(BLUE))
     mixed = np.array(WHITE) + np.abs(strength) * (colour - np.array(WHITE))
     return mixed.round().astype(np.uint8)
+
+
+def eight_bit(picture: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+    """A picture in 0...1 rounded to 8 bit."""
+    return np.rint(picture * 255).astype(np.uint8)
 
 
 def _mapped(level: Shaped[np.ndarray, "h w"], colours: int) -> Colours:

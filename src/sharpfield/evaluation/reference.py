@@ -55,9 +55,9 @@ def trained_on(capture: Capture, *, limit: int | None = None) -> list[Reference]
     known = _known(frames)
     chosen = capture.split.train[known[capture.split.train]]
     if len(chosen):
-        chosen = _spread(chosen, len(chosen) if limit is None else limit)
+        chosen = spread(chosen, len(chosen) if limit is None else limit)
     else:
-        chosen = _spread(capture.split.train, UNSCORED if limit is None else min(limit, UNSCORED))
+        chosen = spread(capture.split.train, UNSCORED if limit is None else min(limit, UNSCORED))
     return [_reference(frames, int(i), own_image=False) for i in chosen]
 
 
@@ -86,7 +86,7 @@ def _known(frames: Frames) -> Shaped[np.ndarray, "n"]:
     return frames.truth_known.astype(bool)
 
 
-def _spread(indices: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
+def spread(indices: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
     """At most `count` of them, evenly spread."""
     if count >= len(indices):
         return indices
