@@ -1,3 +1,4 @@
+# pyright: basic
 """Several neighbouring numbers of an array as one value: loaded, multiplied and stored at once.
 
 Kernels that combine a few scattered rows of channels defeat the compiler's own search for vector
@@ -84,6 +85,17 @@ def store(typing, array, position, row):
 
 
 @intrinsic
+def zeros(typing, array, lanes):
+    """Zeros of the type of the numbers of `array`."""
+    row = Lanes(array.dtype, lanes.count)
+
+    def generate(context, builder, signature, arguments):
+        return ir.Constant(context.get_value_type(row), None)
+
+    return row(array, lanes), generate
+
+
+@intrinsic
 def prefetch(typing, array, position):
     """Ask for the cache line of a number that will soon be needed."""
 
@@ -123,6 +135,14 @@ def _add(typing, one, other):
 
 
 @intrinsic
+def _subtract(typing, one, other):
+    def generate(context, builder, signature, arguments):
+        return builder.fsub(*arguments, flags=CONTRACT)
+
+    return one(one, other), generate
+
+
+@intrinsic
 def _multiply(typing, one, other):
     def generate(context, builder, signature, arguments):
         return builder.fmul(*arguments, flags=CONTRACT)
@@ -145,10 +165,18 @@ def _scale(typing, row, factor):
     return row(row, row.element), generate
 
 
+@overload(operator.iadd)
 @overload(operator.add)
 def _overload_add(one, other):
     if isinstance(one, Lanes) and one == other:
         return lambda one, other: _add(one, other)
+    return None
+
+
+@overload(operator.sub)
+def _overload_subtract(one, other):
+    if isinstance(one, Lanes) and one == other:
+        return lambda one, other: _subtract(one, other)
     return None
 
 
