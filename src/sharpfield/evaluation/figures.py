@@ -10,6 +10,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -222,11 +223,13 @@ def _name(axes: Axes, title: str, across: str, up: str) -> None:
 def _svg(drawing: Figure, name: str, title: str) -> str:
     """The drawing as an SVG element, with names of its own so that several share a page."""
     buffer = io.StringIO()
-    drawing.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+    # Text stays text, in the page's font; the salt makes the same data give the same page.
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        drawing.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(INK, "currentColor")
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'(id="|href="#|url\(#)', rf"\1{name}-", text)
     text = re.sub(r'<svg ([^>]*?)width="[^"]*pt" height="[^"]*pt"', r"<svg \1", text, count=1)
-    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font: \1px inherit", text)
+    text = re.sub(r"font: ([\d.]+)px [^;\"]*", r"font-size: \1px", text)
     return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)

@@ -108,7 +108,7 @@ def _headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     if cost["seconds"] is not None:
         memory = cost["peak_memory_mb"]
         remark = f"{cost['steps']:,} steps" + (f", {memory / 1024:.1f} GiB" if memory else "")
-        found.append((_duration(cost["seconds"]), "of training", remark))
+        found.append((_duration(float(cost["seconds"])), "of training", remark))
     return found
 
 
@@ -188,7 +188,7 @@ def _training(run: Path, metrics: Mapping[str, Any]) -> str:
     cost = metrics["train"]
     facts: dict[str, object] = {}
     if cost["seconds"] is not None:
-        facts["time"] = _duration(cost["seconds"])
+        facts["time"] = _duration(float(cost["seconds"]))
         if cost["steps"]:
             each = 1000 * cost["seconds"] / cost["steps"]
             facts["steps"] = f"{cost['steps']:,}, {each:.3g} ms each"

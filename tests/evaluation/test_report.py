@@ -1,0 +1,150 @@
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sharpfield.core import Paper
+from sharpfield.evaluation import Measuring, Story, evaluate, page, report, write_report
+from sharpfield.evaluation.page import Look, embedded
+from sharpfield.evaluation.report import flat
+from tests.evaluation.fake import Sky, capture
+
+PAPER = Paper("key2024", "A method & more", "@inproceedings{key2024}", ("It is <better>.",))
+STORY = Story("the sky", PAPER, {"seed": 0, "volume": {"samples": (64, 64)}}, "sharpfield train …")
+
+
+class Checker(HTMLParser):
+    """Notes what a page refers to, and whether its tags match."""
+
+    VOID = frozenset(("meta", "img", "input", "br", "use", "path"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.references: list[str] = []
+        self.ids: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.references += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
+        self.ids += [values["id"] or ""] if "id" in values else []
+        if tag == "img":
+            self.images.append(values)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("style", "script"):
+            self.text += data
+
+
+def checked(path: Path) -> Checker:
+    checker = Checker()
+    checker.feed(path.read_text(encoding="utf-8"))
+    assert checker.open == []
+    assert all(r.startswith(("data:image/", "#")) for r in checker.references)
+    assert len(checker.ids) == len(set(checker.ids))
+    assert all(image["alt"] for image in checker.images)
+    assert path.stat().st_size < report.BUDGET_BYTES
+    return checker
+
+
+def test_a_whole_run_is_told(tmp_path: Path):
+    (tmp_path / "training.json").write_text('{"steps": 70, "seconds": 150, "peak_memory_mb": 512}')
+    (tmp_path / "log.csv").write_text("step,seconds,total,validation\n19,1,0.5,\n39,2,0.3,21\n")
+    other = evaluate(Sky(capture(), gain=0.5), capture(), tmp_path / "baselines" / "nerf")
+    baselines = {"nerf": {"mean": other["mean"], "run": "baselines/nerf"}}
+    metrics = evaluate(Sky(capture()), capture(), tmp_path, baselines=baselines)
+    path = write_report(tmp_path, capture(), metrics, STORY)
+    assert path == tmp_path / "report.html"
+    told = checked(path)
+    # 4 training views of 6 pictures and their baseline, 2 held-out ones of 4, 3 frames, events
+    assert len(told.images) == 4 * 6 + 2 * 5 + 3 + 1
+    for text in (
+        f"{metrics['mean']['psnr']:.2f} dB",
+        "LPIPS was not computed",
+        "nerf",
+        "2.5 min",
+        "512 MB",
+        "It is <better>.",
+        "A method & more",
+        "@inproceedings{key2024}",
+        "sharpfield train …",
+        "volume.samples",
+        "64, 64",
+        "500 in",
+    ):
+        assert text in told.text, text
+
+
+@pytest.mark.parametrize(
+    ("lacking", "text"),
+    [
+        (capture(test=()), "No held-out scores: the capture holds no frame out."),
+        (capture(truth=False), "mean over 2 held-out views"),
+        (capture(events=0), "without"),
+        (capture().without(frames=True), "No held-out scores: the capture has no frames"),
+    ],
+)
+def test_what_a_capture_lacks_is_left_out(tmp_path: Path, lacking, text: str):
+    metrics = evaluate(Sky(lacking), lacking, tmp_path)
+    told = checked(write_report(tmp_path, lacking, metrics, Story("odd")))
+    assert text in told.text or text == "without"
+    assert "brighter" in told.text or lacking.events is None
+
+
+def test_events_alone_are_said_to_be_aligned(tmp_path: Path):
+    blind = capture().without(frames=True)
+    metrics = evaluate(Sky(blind), capture(), tmp_path, measuring=Measuring(train_views=1))
+    told = checked(write_report(tmp_path, capture(), metrics, Story("blind")))
+    assert "aligned to the references" in told.text
+
+
+def test_metrics_from_the_file_make_the_same_page(tmp_path: Path):
+    metrics = evaluate(Sky(capture()), capture(), tmp_path)
+    first = write_report(tmp_path, capture(), metrics, STORY).read_bytes()
+    read = json.loads((tmp_path / "metrics.json").read_text())
+    assert write_report(tmp_path, capture(), read, STORY).read_bytes() == first
+
+
+def test_a_page_over_budget_gets_smaller_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    metrics = evaluate(Sky(capture()), capture(), tmp_path)
+    large = write_report(tmp_path, capture(), metrics, STORY).stat().st_size
+    monkeypatch.setattr(report, "LOOKS", (Look(40, 90), Look(20, 30)))
+    monkeypatch.setattr(report, "BUDGET_BYTES", large - 1000)
+    assert write_report(tmp_path, capture(), metrics, STORY).stat().st_size < large - 1000
+
+
+def test_the_slider_can_be_worked_from_the_keyboard():
+    script = page.page("title", "")
+    assert '<input type="range"' in script and "aria-label" in script
+    assert not re.search(r"https?://", script)
+
+
+def test_pictures_are_shrunk_not_enlarged():
+    noise = np.random.default_rng(0).integers(0, 255, (60, 90, 3), np.uint8)
+    sizes = [len(embedded(noise, Look(px, 80))) for px in (30, 90, 400)]
+    assert sizes[0] < sizes[1] == sizes[2]
+
+
+def test_nested_settings_get_dotted_names():
+    assert flat({"a": 1, "b": {"c": (1, 2), "d": {"e": None}, "f": ()}}) == {
+        "a": 1,
+        "b.c": "1, 2",
+        "b.d.e": None,
+        "b.f": "none",
+    }
