@@ -30,6 +30,10 @@ from sharpfield.ops.encoding import frequencies, frequencies_width
 ORIGIN_STEP = 0.01
 """Factor on the network's shift of a ray's origin; world units."""
 
+SPREAD, JITTER = 0.1, 0.1
+"""Standard deviations, in windows: of the canonical points at first, and of the noise on them while
+training, which keeps the network smooth."""
+
 OCTAVES = 2
 """Of the encoding of a point and of its place in the image."""
 
@@ -57,9 +61,6 @@ class SparsePoints(nn.Module):
         code: Width of an image's code.
         width: Of the four hidden layers; the last also sees the input again.
         window_px: Unit of the canonical points, about the half width of a kernel.
-        spread: First standard deviation of the canonical points, in windows.
-        jitter: Standard deviation, in windows, of the noise on the points while training; it
-            keeps the network smooth.
         generator: Where the first parameters come from.
     """
 
@@ -72,14 +73,12 @@ class SparsePoints(nn.Module):
         code: int = 32,
         width: int = 64,
         window_px: float = 10.0,
-        spread: float = 0.1,
-        jitter: float = 0.1,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        self.size, self.window_px, self.jitter = size, window_px, jitter
+        self.size, self.window_px = size, window_px
         self.codes = FrameVectors(frames, code)
-        first = spread * torch.randn(frames, points, 2, generator=generator)
+        first = SPREAD * torch.randn(frames, points, 2, generator=generator)
         self.canonical = nn.Parameter(first)
         inputs = code + 2 * frequencies_width(2, OCTAVES)
         self.network = Dense([inputs, *4 * [width], 5], generator=generator, skips=(4,))
@@ -91,7 +90,7 @@ class SparsePoints(nn.Module):
             noise = torch.randn(
                 point.shape, generator=generator, device=point.device, dtype=point.dtype
             )
-            point = point + self.jitter * noise
+            point = point + JITTER * noise
         place = 2 * seen.xy / seen.xy.new_tensor(self.size) - 1
         of_pixel = torch.cat([self.codes(seen.frame), frequencies(place, OCTAVES)], -1)
         of_pixel = of_pixel[:, None].expand(-1, point.shape[1], -1)
