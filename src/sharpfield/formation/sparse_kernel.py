@@ -59,7 +59,7 @@ class SparsePoints(nn.Module):
         size: (width, height) of the images.
         points: Rays for each pixel.
         code: Width of an image's code.
-        width: Of the four hidden layers; the last also sees the input again.
+        width: Of the four hidden layers; the layer after them sees the input again.
         window_px: Unit of the canonical points, about the half width of a kernel.
         generator: Where the first parameters come from.
     """
