@@ -48,7 +48,7 @@ class Op(Generic[P, R]):
         self.example: Example | None = None
         self.used: set[str] = set()
         self._fast: dict[str, tuple[str, Callable[P, R]]] = {}
-        self._fast_module = f"{folder}.fast.{file}"
+        self._fast_folder, self._file = f"{folder}.fast", file
         _ops[self.name] = self
 
     def accelerate(self, device: str, *, needs: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -71,7 +71,7 @@ class Op(Generic[P, R]):
 
     def fast(self) -> dict[str, tuple[str, Callable[P, R]]]:
         """The fast versions: by device, the package each one needs and the function."""
-        _import_once(self._fast_module)
+        _import_once(self._fast_folder, self._file)
         return self._fast
 
     def pick(self, device: str) -> Callable[P, R]:
@@ -131,9 +131,12 @@ def versions() -> dict[str, str]:
 
 
 @functools.cache
-def _import_once(module: str) -> None:
-    if importlib.util.find_spec(module) is not None:
-        importlib.import_module(module)
+def _import_once(folder: str, file: str) -> None:
+    """Import a file of fast versions, if there is one."""
+    if not folder.startswith(".") and importlib.util.find_spec(folder) is not None:
+        module = f"{folder}.{file}"
+        if importlib.util.find_spec(module) is not None:
+            importlib.import_module(module)
 
 
 @functools.cache

@@ -46,7 +46,7 @@ def _look_up(
 ) -> Tensor:
     grids = [grid.contiguous() for grid in (*planes, *lines)]
     found = _Lookup.apply(points.reshape(-1, 3).contiguous(), basis, *grids)
-    return found.reshape(*points.shape[:-1], -1)
+    return found.reshape(*points.shape[:-1], found.shape[-1])
 
 
 class _Lookup(torch.autograd.Function):
