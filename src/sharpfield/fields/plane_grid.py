@@ -18,6 +18,9 @@ from sharpfield.ops.grid import grid_shape, plane_line_mixture
 CHANNELS = (64, 16, 16)
 """Features of the xy, xz and yz plane (Ev-DeblurNeRF's recipes)."""
 
+OCTAVES = (10, 4)
+"""Frequencies in the encoding of position and of direction."""
+
 
 @dataclass(frozen=True)
 class HeadSize:
@@ -81,8 +84,7 @@ class PlaneHead(nn.Module):
         looked: Width of the looked-up features.
         size: Widths of the layers.
         generator: Where the first parameters come from.
-        position: Octaves of the position's encoding.
-        direction: Octaves of the direction's encoding.
+        octaves: Frequencies in the encoding of position and of direction.
         precision: What the layers compute in; parameters, density and colour stay float32.
     """
 
@@ -92,19 +94,17 @@ class PlaneHead(nn.Module):
         size: HeadSize,
         *,
         generator: torch.Generator,
-        position: int = 10,
-        direction: int = 4,
+        octaves: tuple[int, int] = OCTAVES,
         precision: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        self.position, self.direction, self.precision = position, direction, precision
-        width = looked + frequencies_width(3, position)
-        self.body = Dense(
-            [width, size.hidden, size.feature + 1], generator=generator, bias=False
-        )
+        self.position, self.direction = octaves
+        self.precision = precision
+        width = looked + frequencies_width(3, self.position)
+        self.body = Dense([width, size.hidden, size.feature + 1], generator=generator, bias=False)
         self.first = SplitLinear(
             size.feature,
-            frequencies_width(3, direction),
+            frequencies_width(3, self.direction),
             size.colour,
             generator=generator,
             bias=False,
@@ -137,7 +137,8 @@ class PlaneField(nn.Module):
         heads: Widths of the coarse and of the fine head.
         features: Width of what one look-up gives.
         channels: Features of the planes of both volumes.
-        precision: What the fine head computes in.
+        octaves: Frequencies in the encoding of position and of direction.
+        precision: What the heads compute in.
     """
 
     def __init__(
@@ -149,15 +150,17 @@ class PlaneField(nn.Module):
         heads: tuple[HeadSize, HeadSize] = (COARSE, FINE),
         features: int = 32,
         channels: tuple[int, int, int] = CHANNELS,
+        octaves: tuple[int, int] = OCTAVES,
         precision: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
         self.volumes = nn.ModuleList(
-            Volume(box, count, features, generator=generator, channels=channels)
-            for count in voxels
+            Volume(box, count, features, generator=generator, channels=channels) for count in voxels
         )
-        self.coarse = PlaneHead(features, heads[0], generator=generator, precision=precision)
-        self.fine = PlaneHead(2 * features, heads[1], generator=generator, precision=precision)
+        self.coarse, self.fine = (
+            PlaneHead(width, size, generator=generator, octaves=octaves, precision=precision)
+            for width, size in zip((features, 2 * features), heads, strict=True)
+        )
 
     def look(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]

@@ -207,6 +207,11 @@ class Model(nn.Module):
             )
         trusted = trust(recipe.kernel, begin=recipe.frames.blur_from, steps=recipe.steps)
         return KernelTerm(
-            recipe.frames, volume, self.tone.encode, weight,
-            blur=blur, trusted=trusted, prior=middle,
+            recipe.frames,
+            volume,
+            self.tone.encode,
+            weight,
+            blur=blur,
+            trusted=trusted,
+            prior=middle,
         )

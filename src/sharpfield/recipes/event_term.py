@@ -25,8 +25,8 @@ from sharpfield.formation.tone import gamma
 from sharpfield.losses.events import BAYER_WEIGHTS, contrast_error
 from sharpfield.ops.event_index import build as build_index
 
-THRESHOLD = "threshold"
-"""Note of a capture that gives its contrast threshold, for both signs or as (negative, positive)."""
+NOTED = ("threshold_off", "threshold_on")
+"""Notes of a capture that give its contrast thresholds to darker and to brighter."""
 
 USUAL = 0.2
 """Threshold where nothing says otherwise: that of the published synthetic data."""
@@ -135,13 +135,12 @@ class EventTerm(nn.Module):
         return [Group("response", own, rate)] if (own := tuple(self.parameters())) else []
 
 
-def thresholds_of(
-    capture: Capture, given: tuple[float, float] | None
-) -> tuple[float, float]:
+def thresholds_of(capture: Capture, given: tuple[float, float] | None) -> tuple[float, float]:
     """Contrast thresholds to darker and to brighter: those given, those noted, or the usual ones."""
-    noted = capture.notes.get(THRESHOLD, USUAL)
-    pair = [float(x) for x in torch.as_tensor(noted if given is None else given).reshape(-1)]
-    return pair[0], pair[-1]
+    if given is not None:
+        return given
+    negative, positive = (float(capture.notes.get(name, USUAL)) for name in NOTED)
+    return negative, positive
 
 
 def _mono(seen: EventPairs) -> EventPairs:

@@ -70,9 +70,7 @@ class FrameTerm(nn.Module):
         count = options.blurred_pixels if self.blurred(step) else options.pixels
         return draw_pixels(self.table, count, seed=self.seed, step=step, device=device)
 
-    def stored_error(
-        self, light: Radiance, target: Float[Tensor, "*b c"]
-    ) -> Float[Tensor, ""]:
+    def stored_error(self, light: Radiance, target: Float[Tensor, "*b c"]) -> Float[Tensor, ""]:
         """Mean squared error of each ray's stored value, fine and coarse."""
         assert light.coarse is not None
         return mse(self.tone(light.rgb), target) + mse(self.tone(light.coarse.rgb), target)
@@ -107,9 +105,7 @@ class KernelTerm(FrameTerm):
             light = volume.sharp(
                 self.blur.expose(seen), step, "frames", samples=self.blur.adaptive is not None
             )
-            terms = self.blur.losses(
-                light, seen, trusted=self.trusted(iteration), rigid=counts
-            )
+            terms = self.blur.losses(light, seen, trusted=self.trusted(iteration), rigid=counts)
         if self.prior is not None:
             error = self.stored_error(light[:, 0], self.prior.target(seen))
             terms["prior"] = self.prior_weight(step) * error

@@ -34,6 +34,8 @@ class VolumeOptions:
     """Coarse head: hidden width, features, width of the colour layers."""
     fine: tuple[int, int, int] = (256, 128, 256)
     """Fine head."""
+    octaves: tuple[int, int] = (10, 4)
+    """Frequencies in the encoding of position and of direction."""
     samples: tuple[int, int] = (64, 64)
     """Coarse points on a ray, and fine points added to them."""
     noise: float = 1.0
@@ -86,6 +88,7 @@ class Volume(nn.Module):
                 generator=made,
                 heads=(HeadSize(*options.coarse), HeadSize(*options.fine)),
                 channels=options.channels,
+                octaves=options.octaves,
                 precision=_precision(options.precision),
             )
         how = Compositing(

@@ -91,10 +91,11 @@ def gather(head: Head, work: Work, how: Compositing, *, keep_feature: bool = Fal
         found = _all(head, looked, piece, how, keep_feature=keep_feature)
         return found.rgb, found.depth, found.opacity, found.weights, found.feature
 
-    # What is looked up is passed as a tensor of its own, so that gradients reach it.
+    # What is looked up is passed as a tensor of its own, so that gradients reach it; split at once,
+    # because the gradient of a slice is a tensor of zeros as large as the whole.
     parts = [
-        Found(*checkpoint(run, piece.looked, piece, use_reentrant=False, preserve_rng_state=False))
-        for piece in pieces
+        Found(*checkpoint(run, looked, piece, use_reentrant=False, preserve_rng_state=False))
+        for looked, piece in zip(work.looked.split(step), pieces, strict=True)
     ]
     return Found.cat(parts)
 

@@ -1,0 +1,115 @@
+"""NeRF: a sharp scene from frames taken as they are. The baseline that blur and events must beat.
+
+B. Mildenhall et al., *NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis*,
+ECCV 2020. With `field.kind="planes"` the same method on factored feature volumes, which learn in
+minutes what the large networks learn in hours.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.measurements import Batch, Pixels
+from sharpfield.core.paper import Paper
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, constant, exponential
+from sharpfield.formation.tone import tone_of
+from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, Terms
+from sharpfield.recipes.volume import Volume, VolumeOptions
+
+PAPER = Paper(
+    key="mildenhall2020nerf",
+    title="NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis",
+    bibtex="""@inproceedings{mildenhall2020nerf,
+  title     = {{NeRF}: Representing Scenes as Neural Radiance Fields for View Synthesis},
+  author    = {Mildenhall, Ben and Srinivasan, Pratul P. and Tancik, Matthew and
+               Barron, Jonathan T. and Ramamoorthi, Ravi and Ng, Ren},
+  booktitle = {European Conference on Computer Vision (ECCV)},
+  year      = {2020}
+}""",
+    departures=(
+        "The scene is linear light and frames are encoded by their own response; the published"
+        " code works on stored values throughout.",
+        "The default field is that of PDRF; the published networks are the preset `paper`.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class NeRF:
+    """Frames to a scene, blur and all."""
+
+    paper: ClassVar[Paper] = PAPER
+
+    steps: int = 200_000
+    """Length of the schedule."""
+    rate: float = 5e-4
+    """First learning rate."""
+    decay: int = 250_000
+    """Steps in which it falls to a tenth."""
+    smooth: float = 0.0
+    """Weight of the total variation of planes and lines."""
+    pixels: int = 1024
+    """Drawn per step."""
+    volume: VolumeOptions = field(
+        default_factory=lambda: VolumeOptions(kind="mlp", samples=(64, 128))
+    )
+
+    def lasting(self, steps: int) -> "NeRF":
+        """The same recipe with its whole schedule stretched or shrunk to `steps`."""
+        return replace(self, steps=steps, decay=max(round(self.decay * steps / self.steps), 1))
+
+    def build(self, capture: Capture, seed: int) -> "Model":
+        """The recipe on one capture."""
+        return Model(self, capture, seed)
+
+
+class Model(nn.Module):
+    """A field and the frames it explains, one ray per pixel."""
+
+    heaviest_step = 0
+
+    def __init__(self, recipe: NeRF, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.recipe = recipe
+        self.volume = Volume(recipe.volume, capture, seed)
+        self.capture = self.volume.capture
+        self.tone = tone_of(capture.needed_frames.encoding)
+        self.frames = KernelTerm(
+            FrameOptions(blur="none", pixels=recipe.pixels),
+            self.volume,
+            self.tone.encode,
+            constant(0.0),
+            blur=None,
+            trusted=constant(0.0),
+            prior=None,
+        )
+        self.rate = exponential(recipe.rate, recipe.rate / 10, until=recipe.decay)
+
+    def draw(self, step: int) -> Batch:
+        """Pixels of the training frames."""
+        return {"frames": self.frames.draw(step, self.volume.device)}
+
+    def losses(self, batch: Batch, step: int) -> Terms:
+        """Error of the pixels, fine and coarse."""
+        assert isinstance(seen := batch["frames"], Pixels)
+        terms = self.frames.terms(self.volume, seen, step)
+        if self.recipe.smooth > 0:
+            terms["smooth"] = self.recipe.smooth * self.volume.smoothness()
+        return terms
+
+    def render(self, rays: Rays) -> Radiance:
+        """Linear light."""
+        return self.volume.view(rays)
+
+    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """As the frames store it."""
+        return self.tone.encode(light).clamp(0, 1)
+
+    def groups(self) -> list[Group]:
+        """Networks and grids at one rate."""
+        return self.volume.groups(self.rate)

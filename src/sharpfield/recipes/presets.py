@@ -1,0 +1,195 @@
+"""Presets: named changes of a recipe, of two kinds that combine.
+
+A *variant* says what is modelled (`blender_full`, `physical`, ...), a *size* how much of it a
+machine can take (`draft`, `standard`, `paper`). `--preset physical,draft` applies both, in order.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
+from sharpfield.recipes.event_term import EventOptions
+from sharpfield.recipes.frame_term import FrameOptions
+from sharpfield.recipes.learned_blur import KernelOptions
+from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.prior import PriorOptions
+from sharpfield.recipes.volume import VolumeOptions
+
+
+def blender_full(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """The paper's recipe for its synthetic data."""
+    return replace(
+        recipe,
+        smooth=1.0,
+        frames=FrameOptions(),
+        kernel=KernelOptions(),
+        events=EventOptions(),
+        prior=PriorOptions(),
+    )
+
+
+def blender_minus(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """Ev-DeblurNeRF--: no prior and no learned response; events follow display values."""
+    return replace(
+        blender_full(recipe),
+        events=EventOptions(response="gamma"),
+        prior=PriorOptions(weight=0.0),
+    )
+
+
+def cdavis_full(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """The paper's recipe for its real data: colour events; frames count once blur is modelled."""
+    return replace(
+        blender_full(recipe),
+        frames=FrameOptions(frames_from=1201),
+        events=EventOptions(pairs=2048, threshold=(0.25, 0.25), half_pixel=False),
+        prior=PriorOptions(weight=1.0, end=1.0),
+    )
+
+
+def physical(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """Known motion instead of a learned kernel, sharp targets all along each exposure."""
+    return replace(
+        recipe,
+        smooth=0.02,
+        volume=replace(recipe.volume, noise=0.0, density="softplus"),
+        frames=FrameOptions(blur="auto", blurred_pixels=256, blur_from=20_000),
+        kernel=KernelOptions(integration="samples", norm="layer"),
+        events=EventOptions(response="residual"),
+        prior=PriorOptions(weight=1.0, end=0.1, until=30_000, domain="linear"),
+    )
+
+
+DRAFT: dict[str, Any] = {
+    "voxels": (80**3, 160**3),
+    "channels": (16, 8, 8),
+    "coarse": (32, 15, 32),
+    "fine": (64, 32, 64),
+    "octaves": (2, 2),
+    "samples": (32, 32),
+    "precision": "auto",
+}
+
+STANDARD: dict[str, Any] = {
+    "voxels": (160**3, 320**3),
+    "channels": (32, 16, 16),
+    "coarse": (64, 15, 64),
+    "fine": (128, 64, 128),
+    "octaves": (6, 4),
+    "samples": (48, 48),
+    "precision": "auto",
+}
+
+
+def draft(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """Minutes on two processor cores."""
+    recipe = replace(recipe.lasting(1500), rate=1e-2, volume=replace(recipe.volume, **DRAFT))
+    frames = recipe.frames
+    frames = replace(
+        frames,
+        pixels=min(frames.pixels, 512),
+        blurred_pixels=min(frames.blurred_pixels, 64),
+        instants=min(frames.instants, 5),
+    )
+    return replace(recipe, frames=frames, events=replace(recipe.events, pairs=256))
+
+
+def standard(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """Minutes on a graphics card, hours on a processor."""
+    return replace(recipe.lasting(10_000), volume=replace(recipe.volume, **STANDARD))
+
+
+def paper(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
+    """The published size and length."""
+    whole = VolumeOptions()
+    volume = replace(
+        recipe.volume,
+        voxels=whole.voxels,
+        channels=whole.channels,
+        coarse=whole.coarse,
+        fine=whole.fine,
+        octaves=whole.octaves,
+        samples=whole.samples,
+        precision=whole.precision,
+    )
+    return replace(recipe.lasting(30_000), rate=5e-3, volume=volume)
+
+
+def nerf_draft(recipe: NeRF) -> NeRF:
+    """Planes instead of large networks; minutes on two processor cores."""
+    volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **DRAFT)
+    return NeRF(steps=1500, rate=1e-2, decay=500, smooth=0.02, pixels=512, volume=volume)
+
+
+def nerf_standard(recipe: NeRF) -> NeRF:
+    """Planes; minutes on a graphics card."""
+    volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **STANDARD)
+    return NeRF(steps=10_000, rate=5e-3, decay=3333, smooth=0.02, volume=volume)
+
+
+def nerf_paper(recipe: NeRF) -> NeRF:
+    """The published networks and length."""
+    return NeRF()
+
+
+Change = Callable[[Any], Any]
+VARIANTS: Mapping[str, Mapping[str, Change]] = {
+    "ev-deblur-nerf": {
+        "physical": physical,
+        "blender_full": blender_full,
+        "blender_minus": blender_minus,
+        "cdavis_full": cdavis_full,
+    },
+    "nerf": {},
+}
+"""What is modelled, by recipe."""
+
+SIZES: Mapping[str, Mapping[str, Change]] = {
+    "ev-deblur-nerf": {"draft": draft, "standard": standard, "paper": paper},
+    "nerf": {"draft": nerf_draft, "standard": nerf_standard, "paper": nerf_paper},
+}
+"""How much of it, by recipe."""
+
+
+def names(recipe: str) -> dict[str, str]:
+    """The presets of a recipe, and what each means."""
+    changes = {**VARIANTS.get(recipe, {}), **SIZES.get(recipe, {})}
+    return {name: (change.__doc__ or "").strip() for name, change in changes.items()}
+
+
+def prepared(recipe: str, start: Any, preset: str, *, capture: Capture, device: str) -> Any:
+    """A recipe with presets applied; what `preset` leaves open follows capture and machine.
+
+    Without a size, a processor gets `draft` and a graphics card `standard`. Without a variant, the
+    size `paper` gets the published recipe for this kind of sensor and the others `physical`.
+
+    Args:
+        recipe: Its name.
+        start: The recipe with its own defaults.
+        preset: Names with commas between them; may be empty.
+        capture: What it will be built on.
+        device: `cpu` or `cuda`.
+
+    Raises:
+        OptionError: A name is unknown.
+    """
+    variants, sizes = VARIANTS.get(recipe, {}), SIZES.get(recipe, {})
+    chosen = [name for name in preset.replace("+", ",").split(",") if name]
+    for name in chosen:
+        if name not in variants and name not in sizes:
+            raise OptionError(
+                f"the recipe {recipe} has no preset {name!r}",
+                do=f"use {', '.join([*variants, *sizes])}, or several with commas between them",
+            )
+    if sizes and not any(name in sizes for name in chosen):
+        chosen.append("draft" if device == "cpu" else "standard")
+    if variants and not any(name in variants for name in chosen):
+        coloured = capture.events is not None and capture.events.coloured
+        published = "cdavis_full" if coloured else "blender_full"
+        chosen.insert(0, published if "paper" in chosen else "physical")
+    for name in sorted(chosen, key=lambda name: name in sizes):  # variants first
+        start = {**variants, **sizes}[name](start)
+    return start
