@@ -10,7 +10,7 @@ def test_a_capture_is_recognised_by_its_files(tiny, tmp_path):
     assert layout_of(tmp_path / "a") == "native"
     assert layout_of(tmp_path / "b") == "ev-deblur-nerf"
     assert read(tmp_path / "a").name == "tiny"
-    assert read(tmp_path / "b").name == "b"
+    assert read(str(tmp_path / "b")).name == "b"
 
 
 @pytest.mark.parametrize(

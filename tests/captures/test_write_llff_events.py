@@ -48,6 +48,13 @@ def test_a_mono_capture_comes_back(tiny, tmp_path):
         assert one.dtype == other.dtype
 
 
+def test_known_thresholds_come_back(tiny, tmp_path):
+    noted = replace(tiny, notes={"threshold_on": 0.31, "threshold_off": 0.17})
+    found = returned(noted, tmp_path).notes
+    assert (found["threshold_on"], found["threshold_off"]) == (0.31, 0.17)
+    assert returned(tiny, tmp_path).notes["threshold_on"] == 0.2  # the authors' own
+
+
 def test_its_files_are_those_of_the_published_data(tiny, tmp_path):
     write_llff_events.write(tiny, tmp_path / "scene")
     folder = tmp_path / "scene"

@@ -46,6 +46,8 @@ class EventFile:
     ms_to_idx: Column | None = None
     bayer: str = ""
     site_colour: SiteColour | None = None
+    thresholds: tuple[float, float] | None = None
+    """Contrast thresholds (natural log) to darker and to brighter, where the file states them."""
     resources: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> "EventFile":

@@ -32,12 +32,15 @@ COLUMNS = ("x", "y", "t", "p")
 TICKS = {1: "ns", 1000: "us", 1_000_000: "ms"}
 """Units of time by the attribute `tick_ns`."""
 
+THRESHOLDS = ("threshold_off", "threshold_on")
+"""Attributes of a file, and notes of a capture, that give the contrast thresholds."""
+
 BLOSC, PROPHESEE_ECF = 32001, 0x8ECF
 """Numbers of HDF5 compression filters that need a plugin."""
 
 
 def open_events(
-    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
+    path: Path | str, *, unit: str | None = None, size: tuple[int, int] | None = None
 ) -> EventFile:
     """Open a file of events.
 
@@ -51,6 +54,7 @@ def open_events(
         CaptureError: The file is missing, truncated, or holds no events in a known layout.
         MissingExtra: It is compressed by Blosc and the plugin is not installed.
     """
+    path = Path(path)
     if not path.is_file():
         raise CaptureError("event file not found", where=path)
     opened = _open_npz(path) if path.suffix == ".npz" else _open_hdf5(path)
@@ -115,6 +119,7 @@ def _open_hdf5(path: Path) -> EventFile:
             else None,
             bayer=str(file.attrs.get("bayer", "")),
             site_colour=_site_colour(file, path),
+            thresholds=_thresholds(file),
             resources=resources.pop_all(),
         )
     raise AssertionError("the block above returns or raises")
@@ -122,6 +127,13 @@ def _open_hdf5(path: Path) -> EventFile:
 
 def _whole(file: h5py.File, attribute: str, fallback: int) -> int:
     return int(np.asarray(file.attrs.get(attribute, fallback)).item())
+
+
+def _thresholds(file: h5py.File) -> tuple[float, float] | None:
+    if not set(THRESHOLDS) <= set(file.attrs):
+        return None
+    off, on = (float(np.asarray(file.attrs[name]).item()) for name in THRESHOLDS)
+    return off, on
 
 
 def _offset_us(file: h5py.File, unit: str, path: Path) -> int:

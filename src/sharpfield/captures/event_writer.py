@@ -110,7 +110,7 @@ class EventWriter:
 
 @contextmanager
 def writing_events(
-    path: Path, like: EventStream, *, span_us: int | None = None
+    path: Path | str, like: EventStream, *, span_us: int | None = None
 ) -> Iterator[EventWriter]:
     """A writer for `path`; the file appears when the block ends well, whole, or not at all.
 
@@ -119,6 +119,7 @@ def writing_events(
         like: Any stream of the same sensor (it may be empty): its size and colour are written.
         span_us: Length of the recording, where it is known; a short one takes less memory to read.
     """
+    path = Path(path)
     with replacing(path) as temporary:
         with h5py.File(temporary, "w", libver=("v110", "latest")) as file:
             file.attrs.update(
@@ -137,7 +138,7 @@ def writing_events(
             writer.finish()
 
 
-def write_events(path: Path, events: EventStream) -> None:
+def write_events(path: Path | str, events: EventStream) -> None:
     """Write a whole stream, which may be memory-mapped."""
     span_us = int(events.t_us[-1] - events.t_us[0]) if len(events) else 0
     with writing_events(path, events[:0], span_us=span_us) as writer:

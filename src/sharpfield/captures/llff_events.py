@@ -29,7 +29,7 @@ from sharpfield.captures.arrays import load_array, load_arrays
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
 from sharpfield.captures.event_columns import whole_us
-from sharpfield.captures.event_layouts import open_events
+from sharpfield.captures.event_layouts import THRESHOLDS, open_events
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import choose_images
@@ -113,9 +113,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     bounds = (along if variant.reference_poses == "trajectory" else table).bounds
     off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
     trajectory, track = _tracks(path, table, off)
-    events, notes = _events(
-        folder, camera, path, event_unit=event_unit, usual_unit=variant.event_unit
-    )
+    events, notes = _events(folder, camera, path, event_unit=event_unit, variant=variant)
     names = tuple(file.stem for file in paths)
     truth, truth_known = _truth(folder / "truth.npz", names, images)
     return Capture(
@@ -130,11 +128,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
         name=folder.resolve().name,
         source=LAYOUT,
         notes=notes
-        | {
-            REFERENCE: variant.reference_poses,
-            "threshold_on": variant.threshold,
-            "threshold_off": variant.threshold,
-        }
+        | {REFERENCE: variant.reference_poses}
         | ({"frames_off_trajectory": ", ".join(np.array(names)[off])} if off.any() else {}),
     )
 
@@ -209,13 +203,13 @@ def _tracks(
 
 
 def _events(
-    folder: Path, camera: Camera, path: Stamped, *, event_unit: str | None, usual_unit: str
+    folder: Path, camera: Camera, path: Stamped, *, event_unit: str | None, variant: Variant
 ) -> tuple[EventStream, Notes]:
     """Events while the pose is known, and what was done to them."""
     known_us = path.known_us(0)
-    notes: Notes = {}
+    notes: Notes = dict.fromkeys(THRESHOLDS, variant.threshold)
     with open_events(folder / "events.h5", unit=event_unit, size=camera.size) as opened:
-        file = opened if opened.unit else replace(opened, unit=usual_unit)
+        file = opened if opened.unit else replace(opened, unit=variant.event_unit)
         if len(file):
             expect_overlap(
                 file.span_us(),
@@ -229,6 +223,8 @@ def _events(
             notes["events_outside_trajectory"] = float(len(file) - len(events))
         if file.unit == "ns":
             notes["event_times"] = "rounded from ns to us"
+        if file.thresholds is not None:
+            notes |= dict(zip(THRESHOLDS, file.thresholds, strict=True))
     if (folder / "ev_map.npz").is_file():
         events = replace(events, site_colour=_site_colour(folder / "ev_map.npz", camera))
     return events, notes

@@ -46,13 +46,14 @@ def recognise(folder: Path) -> bool:
     return (folder / DESCRIPTION).is_file()
 
 
-def write(capture: Capture, folder: Path) -> None:
+def write(capture: Capture, folder: Path | str) -> None:
     """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
 
     Raises:
         CaptureError: The folder holds something that is not a capture, or the capture holds
             something the layout has no place for.
     """
+    folder = Path(folder)
     expect_replaceable(folder, recognise)
     arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
     with replacing_folder(folder) as fresh:

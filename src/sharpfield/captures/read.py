@@ -12,6 +12,7 @@ from sharpfield.captures import (
     nerf_synthetic,
     nerfstudio,
 )
+from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.photos import Missing
 from sharpfield.core.capture import Capture
@@ -81,7 +82,7 @@ def layout_of(folder: Path) -> str:
 
 
 def read(
-    folder: Path,
+    folder: Path | str,
     *,
     layout: str | None = None,
     event_unit: str | None = None,
@@ -105,6 +106,7 @@ def read(
         CaptureError: The capture cannot be read.
         OptionError: An option does not fit the layout.
     """
+    folder = Path(folder)
     name = layout or layout_of(folder)
     if name not in LAYOUTS:
         raise OptionError("unknown layout", got=name, do=f"use one of {', '.join(LAYOUTS)}")
@@ -123,6 +125,6 @@ def read(
     if hold_out is not None:
         capture = replace(capture, split=split_by_rule(len(capture.needed_frames), hold_out))
     if threshold is not None:
-        known = {"threshold_on": threshold, "threshold_off": threshold}
+        known = dict.fromkeys(THRESHOLDS, threshold)
         capture = replace(capture, notes=capture.notes | known)
     return capture

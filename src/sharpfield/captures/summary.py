@@ -27,7 +27,7 @@ EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
 
 
 def summary(
-    path: Path, *, event_unit: str | None = None, layout: str | None = None
+    path: Path | str, *, event_unit: str | None = None, layout: str | None = None
 ) -> dict[str, Any]:
     """What is at a path: a capture's folder, or a single file of events.
 
@@ -39,6 +39,7 @@ def summary(
     Raises:
         CaptureError: It cannot be read.
     """
+    path = Path(path)
     if path.is_file() and path.suffix in EVENT_SUFFIXES:
         with open_events(path, unit=event_unit) as file:
             told = file if file.unit else replace(file, unit=_unit_of_layout(path))

@@ -3,7 +3,7 @@
 A mono event camera gives the Blender variant (times in ns), a colour one the Color-DAVIS variant
 (times in us, `ev_map.npz`). The layout has no place for lens distortion, a principal point off the
 centre, other than 8-bit RGB images, or another choice of held-out frames; a capture with these is
-refused. Notes and sparse points are left out, and images are numbered anew.
+refused. Sparse points and notes but the thresholds are left out, and images are numbered anew.
 """
 
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.event_file import CHUNK
+from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import write_image
@@ -42,13 +43,14 @@ class Stamps:
     poses: Float64[np.ndarray, "p 3 4"]
 
 
-def write(capture: Capture, folder: Path) -> None:
+def write(capture: Capture, folder: Path | str) -> None:
     """Write frames, events and trajectory; the folder appears whole or not at all.
 
     Raises:
         CaptureError: The folder holds something that is not a capture, or the layout has no place
             for something essential.
     """
+    folder = Path(folder)
     expect_replaceable(folder, recognise)
     frames, events = capture.needed_frames, capture.needed_events
     variant = COLOR_DAVIS if events.coloured else BLENDER
@@ -62,7 +64,7 @@ def write(capture: Capture, folder: Path) -> None:
         if variant is COLOR_DAVIS:
             map_x, map_y = _rectified_sites(events, capture.camera)
             np.savez(fresh / "ev_map.npz", inv_mapx=map_x, inv_mapy=map_y)
-        _write_events(fresh / "events.h5", events, variant)
+        _write_events(fresh / "events.h5", capture, variant)
 
 
 def _write_images(frames: Frames, folder: Path) -> None:
@@ -95,13 +97,17 @@ def _write_poses(path: Path, poses: Float64[np.ndarray, "n 3 4"], capture: Captu
     np.save(path, np.concatenate([matrix, bounds], 1))
 
 
-def _write_events(path: Path, events: EventStream, variant: Variant) -> None:
+def _write_events(path: Path, capture: Capture, variant: Variant) -> None:
+    events = capture.needed_events
     ticks = 1000 if variant.event_unit == "ns" else 1
     kinds = {"x": events.x.dtype, "y": events.y.dtype, "t": np.int64, "p": np.uint8}
     if variant is COLOR_DAVIS:
         kinds |= {"x": np.dtype(np.float32), "y": np.dtype(np.float32)}
     with h5py.File(path, "w") as file:
         file.attrs["tick_ns"] = 1000 // ticks
+        for name in THRESHOLDS:
+            if isinstance(capture.notes.get(name), float):
+                file.attrs[name] = capture.notes[name]
         rows = min(ROWS, max(len(events), 1))
         packing = {"chunks": (rows,), "compression": "gzip", "shuffle": True}
         columns = {
