@@ -1,0 +1,142 @@
+"""The contrast thresholds of a capture: given, known from its source, or found from its frames."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from sharpfield.core.capture import Capture
+from sharpfield.formation.edi import latent
+from sharpfield.formation.edi_threshold import (
+    best_threshold,
+    best_thresholds,
+    disagreement,
+    edge_density,
+)
+from sharpfield.formation.threshold import FixedThresholds
+from sharpfield.formation.tone import Tone, tone_of
+from sharpfield.metrics.sharpness import luma
+from sharpfield.preparation.event_motion import EventMotion
+
+PAIRS = 4
+"""Pairs of neighbouring frames looked at, spread over the capture."""
+
+DARK, BRIGHT = 0.01, 0.9
+"""Linear light between which a pixel's value can be trusted."""
+
+Judge = Literal["given", "known", "disagreement", "edge density"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Thresholds, and how they were come by."""
+
+    thresholds: FixedThresholds
+    judge: Judge
+    cost: float | None = None
+    """What the judge says of them; see `formation.edi_threshold`."""
+
+
+def known_thresholds(capture: Capture) -> FixedThresholds | None:
+    """What the source of the capture says, the median over its pixels; None if it is silent."""
+    noted = [capture.notes.get(f"threshold_{sign}") for sign in ("off", "on")]
+    if any(value is None for value in noted):
+        return None
+    negative, positive = (float(np.median(np.asarray(value, float))) for value in noted)
+    return FixedThresholds(negative, positive)
+
+
+def find_thresholds(capture: Capture, motion: EventMotion) -> Found:
+    """Thresholds that explain the blurred frames best.
+
+    Neighbouring frames of one track decide by disagreement, for each sign by itself; a capture of
+    a single blurred frame leaves only the density of edges in the deblurred picture.
+
+    Raises:
+        CaptureError: There are no frames, or no events.
+    """
+    blurred = np.flatnonzero(~capture.needed_frames.exposure.instant)
+    pairs = _neighbours(capture, blurred)
+    if len(pairs):
+        chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, PAIRS).round().astype(int))]
+        judges = [_PairJudge.of(capture, motion, pair) for pair in chosen]
+        found = best_thresholds(
+            lambda tried: float(np.mean([judge.cost(tried) for judge in judges]))
+        )
+        cost = float(np.mean([judge.cost(found) for judge in judges]))
+        return Found(found, "disagreement", cost)
+    single = [_SingleJudge.of(capture, motion, int(frame)) for frame in blurred[:PAIRS]]
+    found = best_threshold(lambda tried: float(np.mean([judge.cost(tried) for judge in single])))
+    return Found(found, "edge density", float(np.mean([judge.cost(found) for judge in single])))
+
+
+def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w c"]:
+    """A frame in linear light."""
+    frames = capture.needed_frames
+    stored = torch.from_numpy(np.asarray(frames.images[frame], np.float32)) / frames.white
+    return tone.decode(stored)
+
+
+def exposure_of(capture: Capture, frame: int) -> tuple[int, int]:
+    """When the shutter of a frame opened and closed."""
+    exposure = capture.needed_frames.exposure
+    return int(exposure.open_us[frame]), int(exposure.close_us[frame])
+
+
+def _neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
+    """Consecutive frames of one track, in order of time."""
+    held = capture.needed_frames
+    order = frames[np.lexsort((held.exposure.open_us[frames], held.track[frames]))]
+    pairs = np.stack([order[:-1], order[1:]], -1).reshape(-1, 2)
+    return pairs[held.track[pairs[:, 0]] == held.track[pairs[:, 1]]]
+
+
+@dataclass(frozen=True)
+class _PairJudge:
+    motion: EventMotion
+    light: Float[Tensor, "n h w c"]
+    windows_us: list[tuple[int, int]]
+    middles_us: list[int]
+
+    @classmethod
+    def of(
+        cls, capture: Capture, motion: EventMotion, pair: Int64[np.ndarray, "2"]
+    ) -> "_PairJudge":
+        tone = tone_of(capture.needed_frames.encoding)
+        light = torch.stack([linear_light(capture, int(frame), tone) for frame in pair])
+        if motion.channel is None:
+            light = luma(light)[..., None]
+        middles = [int(capture.needed_frames.exposure.middle_us[frame]) for frame in pair]
+        return cls(motion, light, [exposure_of(capture, int(frame)) for frame in pair], middles)
+
+    def cost(self, thresholds: FixedThresholds) -> float:
+        paths = [
+            self.motion.path(window, np.array([middle]), thresholds)
+            for window, middle in zip(self.windows_us, self.middles_us, strict=True)
+        ]
+        gap = self.motion.between(self.middles_us[0], self.middles_us[1], thresholds)
+        moved = torch.stack([path.log_mean != 0 for path in paths])
+        usable = moved & (self.light > DARK) & (self.light < BRIGHT)
+        return disagreement(self.light, paths, gap[None], usable)
+
+
+@dataclass(frozen=True)
+class _SingleJudge:
+    motion: EventMotion
+    light: Float[Tensor, "h w c"]
+    window_us: tuple[int, int]
+    tone: Tone
+
+    @classmethod
+    def of(cls, capture: Capture, motion: EventMotion, frame: int) -> "_SingleJudge":
+        tone = tone_of(capture.needed_frames.encoding)
+        window = exposure_of(capture, frame)
+        return cls(motion, linear_light(capture, frame, tone), window, tone)
+
+    def cost(self, thresholds: FixedThresholds) -> float:
+        path = self.motion.path(self.window_us, np.array([sum(self.window_us) // 2]), thresholds)
+        sharp = self.tone.encode(latent(self.light, path, 0).clamp(0, 1))
+        return edge_density(luma(sharp)[..., None])
