@@ -30,12 +30,12 @@ class Clock:
     span_us: int
 
     def unit(self, t_us: Int64[np.ndarray, "*n"] | int) -> Float[np.ndarray, "*n"]:
-        """Fraction of the capture, float64."""
-        return (np.asarray(t_us, np.int64) - self.origin_us) / self.span_us
+        """Fraction of the capture, float64; an array also for a single time."""
+        return np.asarray((np.asarray(t_us, np.int64) - self.origin_us) / self.span_us)
 
     def us(self, unit: Float[np.ndarray, "*n"] | float) -> Int64[np.ndarray, "*n"]:
         """Back to us, rounded."""
-        return np.rint(np.asarray(unit) * self.span_us).astype(np.int64) + self.origin_us
+        return np.asarray(np.rint(np.asarray(unit) * self.span_us).astype(np.int64)) + self.origin_us
 
 
 @dataclass(frozen=True)

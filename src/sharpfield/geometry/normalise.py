@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.space import Similarity, normalisation
-from sharpfield.geometry.trajectory import Moved
+from sharpfield.geometry.trajectory import Moved, Stamped, Tracks
 
 REFERENCE = "reference_poses"
 """Note of a capture that says which poses its normalisation is taken over."""
@@ -26,10 +26,12 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
     known = capture.trajectory.known_us(0)
     along = capture.notes.get(REFERENCE, "frames") == "trajectory" or capture.frames is None
     if along and known is not None:
-        stamps = getattr(capture.trajectory, "poses", None)
-        if stamps is not None:
-            return stamps
-        time = torch.linspace(*(float(capture.clock.unit(t)) for t in known), PATH_SAMPLES)
+        path = capture.trajectory
+        path = path.moving[0] if isinstance(path, Tracks) else path
+        if isinstance(path, Stamped):
+            return path.poses
+        start, end = (float(capture.clock.unit(t)) for t in known)
+        time = torch.linspace(start, end, PATH_SAMPLES)
         return capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES).long()).double().numpy()
     every = np.arange(len(capture.needed_frames))
     return capture.frame_pose(every).double().numpy()

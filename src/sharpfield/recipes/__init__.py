@@ -1,9 +1,35 @@
-"""Recipes: one paper, one file. A package of your own can add some by an entry point."""
+"""Recipes: one paper, one file.
 
+A package of your own adds recipes by the entry point `sharpfield.recipes`.
+"""
+
+from importlib.metadata import entry_points
+from typing import Any
+
+from sharpfield.core.errors import OptionError
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.nerf import NeRF
 
-RECIPES = {"nerf": NeRF, "ev-deblur-nerf": EvDeblurNeRF}
+RECIPES: dict[str, Any] = {"nerf": NeRF, "ev-deblur-nerf": EvDeblurNeRF}
 """By the name that the command line knows."""
 
-__all__ = ["RECIPES", "EvDeblurNeRF", "NeRF"]
+
+def all_recipes() -> dict[str, Any]:
+    """Ours and those of installed packages."""
+    others = {entry.name: entry.load() for entry in entry_points(group="sharpfield.recipes")}
+    return {**others, **RECIPES}
+
+
+def recipe_named(name: str) -> Any:
+    """A recipe's class.
+
+    Raises:
+        OptionError: There is none of this name.
+    """
+    known = all_recipes()
+    if name not in known:
+        raise OptionError("unknown recipe", got=name, do=f"use one of {', '.join(known)}")
+    return known[name]
+
+
+__all__ = ["RECIPES", "EvDeblurNeRF", "NeRF", "all_recipes", "recipe_named"]

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sharpfield.captures import event_index
 from sharpfield.captures.draw import PairTable, draw_pairs, pair_table
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import EventPairs
@@ -23,7 +24,6 @@ from sharpfield.formation.response import (
 from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
 from sharpfield.formation.tone import gamma
 from sharpfield.losses.events import BAYER_WEIGHTS, contrast_error
-from sharpfield.ops.event_index import build as build_index
 
 NOTED = ("threshold_off", "threshold_on")
 """Notes of a capture that give its contrast thresholds to darker and to brighter."""
@@ -70,7 +70,7 @@ class EventTerm(nn.Module):
         events = capture.needed_events
         self.table: PairTable = pair_table(
             capture,
-            build_index(events),
+            event_index(events),
             successors=max(options.accumulate[0], 0) + 1,
             half_pixel=options.half_pixel,
         )

@@ -1,0 +1,175 @@
+"""Commands about captures: make one, look into one, deblur one."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from tyro.conf import Positional
+
+from sharpfield.captures import native, write_llff_events
+from sharpfield.captures.read import read
+from sharpfield.captures.summary import summary
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.preparation.deblur import DeblurOptions
+from sharpfield.preparation.deblur_report import deblur_to
+from sharpfield.simulation import (
+    MOTIONS,
+    SCENES,
+    SENSORS,
+    EventSensor,
+    FrameSensor,
+    Rig,
+    Timing,
+    folder_footage,
+    simulate_footage,
+    video_footage,
+)
+from sharpfield.simulation import simulate as simulate_scene
+
+Size = Annotated[str, tyro.conf.arg(metavar="WxH")]
+
+
+def simulate(
+    out: Path,
+    scene: str = "garden",
+    size: Size = "240x160",
+    layout: Literal["native", "ev-deblur-nerf"] = "native",
+    seed: int = 0,
+    motion: str = "glide",
+    sensor: str = "ideal",
+    timing: Timing = Timing(),  # noqa: B008 - frozen
+    events: EventSensor | None = None,
+) -> None:
+    """Record a closed-form scene with a simulated camera: frames, events, poses, sharp truth.
+
+    Args:
+        out: Folder of the capture.
+        scene: A scene by name.
+        size: Of the sensor, in pixels.
+        layout: Files to write.
+        seed: Of the camera path and of all noise.
+        motion: A camera path by name.
+        sensor: An event camera by name.
+        timing: Frames, exposures and sampling.
+        events: All numbers of the event camera, instead of `sensor`.
+    """
+    for name, value, known in (
+        ("scene", scene, SCENES),
+        ("motion", motion, MOTIONS),
+        ("sensor", sensor, SENSORS),
+    ):
+        _known(name, value, known)
+    rig = Rig(parse_size(size), FrameSensor(), events or SENSORS[sensor])
+    made = simulate_scene(scene, motion, rig=rig, timing=timing, seed=seed)
+    write(replace(made, name=out.name), out, layout)
+    _say_made(made, out)
+
+
+def footage(
+    source: Positional[Path],
+    out: Path,
+    group: int = 40,
+    per_second: float | None = None,
+    sensor: str = "ideal",
+    seed: int = 0,
+) -> None:
+    """Turn sharp high-rate pictures into blurry frames and events (poses stay unknown).
+
+    Args:
+        source: A video, or a folder of pictures.
+        out: Folder of the capture.
+        group: Consecutive pictures in one exposure.
+        per_second: Pictures taken per second; a folder needs it, a video may say it itself.
+        sensor: An event camera by name.
+        seed: Of all noise.
+    """
+    _known("sensor", sensor, SENSORS)
+    opened = folder_footage if source.is_dir() else video_footage
+    shown = opened(source, per_second=per_second)
+    made = simulate_footage(shown, group=group, event_sensor=SENSORS[sensor], seed=seed)
+    native.write(replace(made, name=out.name), out)
+    _say_made(made, out)
+
+
+def inspect(
+    path: Positional[Path],
+    json: bool = False,
+    layout: str | None = None,
+    event_unit: str | None = None,
+) -> None:
+    """Say what a capture, or a file of events, holds.
+
+    Args:
+        path: A capture's folder, or a file of events.
+        json: Print JSON instead of text.
+        layout: Of the capture, if it is not recognised.
+        event_unit: Unit of event times (ns, us, ms, s), where the file does not say.
+    """
+    found = summary(path, layout=layout, event_unit=event_unit)
+    print(_as_json(found) if json else as_text(found))
+
+
+def deblur(
+    capture: Positional[Path],
+    out: Path,
+    layout: str | None = None,
+    options: DeblurOptions = DeblurOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Sharpen blurry frames with the event double integral; nothing is trained.
+
+    Args:
+        capture: Folder of the capture.
+        out: Folder for the pictures, a contact sheet and `deblur.json`.
+        layout: Of the capture, if it is not recognised.
+        options: Threshold, method, instants.
+    """
+    deblur_to(read(capture, layout=layout), out, options)
+    Console().print(f"Sharp frames are in {out}", highlight=False)
+
+
+def write(capture: Capture, out: Path, layout: str) -> None:
+    """Write a capture in a layout."""
+    {"native": native, "ev-deblur-nerf": write_llff_events}[layout].write(capture, out)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height from `WxH`.
+
+    Raises:
+        OptionError: It is not of that form.
+    """
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) > 7 and int(height) > 7):
+        raise OptionError("cannot read the size", got=text, do="give it like 240x160, at least 8x8")
+    return int(width), int(height)
+
+
+def as_text(found: dict[str, Any], indent: int = 0) -> str:
+    """Nested values, a line each."""
+    lines = []
+    for key, value in found.items():
+        if isinstance(value, dict):
+            lines += [" " * indent + key, as_text(value, indent + 2)]
+        else:
+            shown = f"{value:,}" if isinstance(value, int) and value > 9999 else value
+            lines.append(f"{' ' * indent}{key:<{22 - indent}} {shown}")
+    return "\n".join(lines)
+
+
+def _as_json(found: dict[str, Any]) -> str:
+    return json.dumps(found, indent=2)
+
+
+def _known(name: str, value: str, names: Any) -> None:
+    if value not in names:
+        raise OptionError(f"unknown {name}", got=value, do=f"use one of {', '.join(names)}")
+
+
+def _say_made(made: Capture, out: Path) -> None:
+    frames = 0 if made.frames is None else len(made.frames)
+    events = 0 if made.events is None else len(made.events)
+    Console().print(f"{frames} frames and {events:,} events are in {out}", highlight=False)

@@ -1,0 +1,44 @@
+"""The command line: one verb per command, errors in words, exit code 2 when the user can mend it."""
+
+import sys
+from collections.abc import Callable, Sequence
+
+import tyro
+
+from sharpfield.cli.capture_commands import deblur, inspect, simulate
+from sharpfield.cli.demo import demo
+from sharpfield.cli.recipe_commands import recipes
+from sharpfield.cli.run_commands import evaluate, render, train
+from sharpfield.core.errors import SharpfieldError
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "demo": demo,
+    "simulate": simulate,
+    "inspect": inspect,
+    "deblur": deblur,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "recipes": recipes,
+}
+
+ABOUT = "Sharp radiance fields from motion-blurred frames and event-camera streams."
+
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command and exit: 0 done, 2 the user can mend it, 130 interrupted."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="sharpfield",
+            description=ABOUT,
+            args=list(sys.argv[1:] if arguments is None else arguments),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff),
+        )
+    except SharpfieldError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -1,0 +1,155 @@
+"""Commands about runs: train one, measure one, render one."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.progress import track
+from tyro.conf import Positional
+
+from sharpfield.captures.read import read
+from sharpfield.cli.runs import device_named, measure, open_run, start
+from sharpfield.core.errors import OptionError
+from sharpfield.evaluation import Measuring, Refinement, camera_path, refine_poses, write_film
+from sharpfield.metrics.lpips import load_lpips
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.saved import Started
+from sharpfield.rendering.view import render_view
+from sharpfield.training import Options
+
+Device = Literal["auto", "cpu", "cuda"]
+EIGHT_BIT = 255
+
+
+def train(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    preset: str = "",
+    seed: int = 0,
+    device: Device = "auto",
+    use: tuple[str, ...] = ("frames", "events"),
+    options: Options = Options(),  # noqa: B008 - frozen
+    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = (),
+) -> None:
+    """Train a recipe on a capture.
+
+    Args:
+        recipe: Its name; `sharpfield recipes` lists them.
+        capture: Folder of the capture.
+        out: Folder of the run.
+        preset: Named settings, several with commas between them; chosen by capture and machine if
+            left out.
+        seed: Of everything random.
+        device: Where to train.
+        use: Streams of the capture to learn from.
+        options: How long, how often to save, how much memory.
+        change: Single numbers of the recipe, such as events.weight=0 frames.instants=7.
+    """
+    console, where = Console(), device_named(device)
+    source = read(capture)
+    made = prepared(recipe, recipe_named(recipe)(), preset, capture=source, device=where)
+    made = changed(made, change)
+    started = Started(recipe, made, str(capture.resolve()), seed, tuple(use))
+    ledger = start(started, source, out, options, device=where, console=console)
+    if ledger.finished:
+        console.print(f"Done. `sharpfield evaluate {out}` measures it.", highlight=False)
+
+
+def evaluate(
+    run: Positional[Path],
+    capture: Path | None = None,
+    device: Device = "auto",
+    refine: Refinement | None = None,
+    lpips_backbone: Path | None = None,
+    lpips_linear: Path | None = None,
+) -> None:
+    """Measure a run on held-out views; write metrics.json and report.html into it.
+
+    Args:
+        run: Folder that `train` made.
+        capture: Where the capture is, if it moved.
+        device: Where to render.
+        refine: Refine the held-out poses first, with the scene frozen.
+        lpips_backbone: Weights file of torchvision's AlexNet or VGG16, to compute LPIPS.
+        lpips_linear: Weights file of LPIPS's own linear layers.
+    """
+    console = Console()
+    opened = open_run(run, capture=capture, device=device)
+    lpips = None
+    if lpips_backbone is not None and lpips_linear is not None:
+        lpips = load_lpips(lpips_backbone, lpips_linear)
+    poses, stated = {}, {}
+    if refine is not None:
+        found = refine_poses(opened.model, opened.capture, how=refine)
+        poses, stated = found.poses, {"pose_refinement": found.protocol}
+    measuring = Measuring(lpips=lpips, poses=poses, stated=stated)
+    metrics = measure(opened, run, console, measuring=measuring)
+    mean = {name: value for name, value in metrics["mean"].items() if value is not None}
+    console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()), highlight=False)
+    console.print(f"The report is {run / 'report.html'}", highlight=False)
+
+
+def render(
+    run: Positional[Path],
+    out: Path,
+    path: str = "spiral",
+    pictures: int = 60,
+    rate: float = 30.0,
+    capture: Path | None = None,
+    device: Device = "auto",
+) -> None:
+    """Render a run along a camera path.
+
+    Args:
+        run: Folder that `train` made.
+        out: A film FILE.mp4, or a folder for PNGs.
+        path: spiral, train, or exposure:N for the inside of one exposure.
+        pictures: How many.
+        rate: Pictures per second of a film.
+        capture: Where the capture is, if it moved.
+        device: Where to render.
+    """
+    console = Console()
+    opened = open_run(run, capture=capture, device=device)
+    model = opened.model
+    where = device_named(device)
+    camera_moves = camera_path(model.capture, path, pictures=pictures)
+
+    def rendered(number: int) -> np.ndarray:
+        pose = torch.from_numpy(camera_moves.poses[number]).to(where)
+        time = float(camera_moves.time[number])
+        seen = render_view(model.render, model.capture.camera, pose, time)
+        return eight_bit(model.develop(seen.rgb))
+
+    numbers = track(
+        range(len(camera_moves)), "rendering", console=console, disable=not console.is_terminal
+    )
+    count = write_film(out, (rendered(number) for number in numbers), rate=rate)
+    console.print(f"{count} pictures are in {out}", highlight=False)
+
+
+def eight_bit(picture: torch.Tensor) -> np.ndarray:
+    """Stored values 0...1 as bytes."""
+    return (picture.clamp(0, 1) * EIGHT_BIT).round().byte().cpu().numpy()
+
+
+def changed(recipe: Any, changes: tuple[str, ...]) -> Any:
+    """A recipe with some of its numbers changed by name.
+
+    Raises:
+        OptionError: A change is not NAME=VALUE.
+    """
+    words = []
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals:
+            raise OptionError(
+                "cannot read a change of the recipe", got=change, do="write NAME=VALUE"
+            )
+        words += [f"--{name}", *value.split(",")]
+    return tyro.cli(type(recipe), default=recipe, args=words) if words else recipe

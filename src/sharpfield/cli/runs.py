@@ -1,0 +1,142 @@
+"""A run from the command line's point of view: start one, open one again, measure it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from torch import nn
+
+from sharpfield.captures.read import read
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, OptionError, RunError
+from sharpfield.evaluation import Measuring, Story, evaluate, write_report
+from sharpfield.recipes.saved import Started, read_started, write_started
+from sharpfield.training import Ledger, Options, file_of, load, read_ledger, restore_weights, train
+
+STREAMS = ("frames", "events")
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A trained run."""
+
+    started: Started
+    model: Any
+    capture: Capture
+    """All of it, also what the model did not use."""
+
+
+def device_named(name: str) -> str:
+    """`auto` becomes cuda where there is one.
+
+    Raises:
+        OptionError: cuda was asked for and is not there.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise OptionError("there is no CUDA device", do="use --device cpu")
+    return name
+
+
+def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
+    """A capture with only some of its streams.
+
+    Raises:
+        OptionError: A name is unknown.
+    """
+    if unknown := set(streams) - set(STREAMS):
+        raise OptionError("unknown stream", got=", ".join(unknown), do="use frames, events or both")
+    missing = {"frames": capture.frames is None, "events": capture.events is None}
+    left = [name for name in streams if not missing[name]]
+    if not left:
+        raise CaptureError(
+            f"the capture has no {' or '.join(streams)}", where=capture.name, do="use what it has"
+        )
+    return capture.without(frames="frames" not in left, events="events" not in left)
+
+
+def start(
+    started: Started,
+    capture: Capture,
+    run: Path,
+    options: Options,
+    *,
+    device: str,
+    console: Console,
+) -> Ledger:
+    """Train a recipe on a capture in a run folder, or go on with it."""
+    chosen = used(capture, started.use)
+
+    def build(steps: int) -> nn.Module:
+        return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
+
+    if not options.resume:
+        write_started(run, started)
+    return train(
+        build, run, options, steps=started.recipe.steps, settings=started.settings(), console=console
+    )
+
+
+def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") -> Opened:
+    """A run with its trained weights.
+
+    Args:
+        run: Folder that `train` made.
+        capture: Where the capture is now, if it moved; or another one of the same scene and clock.
+        device: Where the model goes.
+
+    Raises:
+        RunError: The run has no checkpoint yet, or is damaged.
+    """
+    started, ledger = read_started(run), read_ledger(run)
+    if ledger is None:
+        raise RunError("this run has not begun", where=run, do="train it first")
+    source = Path(started.capture) if capture is None else capture
+    if not source.exists():
+        raise CaptureError(
+            "the capture of this run is gone",
+            where=run,
+            got=source,
+            do="say where it is now with --capture",
+        )
+    whole = read(source)
+    model = started.recipe.lasting(ledger.planned_steps).build(
+        used(whole, started.use), started.seed
+    )
+    restore_weights(load(file_of(run, "last")), model)
+    return Opened(started, model.to(device_named(device)), whole)
+
+
+def measure(
+    opened: Opened,
+    run: Path,
+    console: Console,
+    *,
+    measuring: Measuring | None = None,
+    baselines: Mapping[str, Mapping[str, Any]] | None = None,
+    title: str = "",
+) -> dict[str, Any]:
+    """Evaluate a run and write its report."""
+    started = opened.started
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("rendering", total=None)
+        metrics = evaluate(
+            opened.model,
+            opened.capture,
+            run,
+            measuring=measuring,
+            baselines=baselines,
+            progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    story = Story(
+        title=title or f"{started.name} on {opened.capture.name}",
+        paper=started.recipe.paper,
+        settings=started.settings(),
+    )
+    write_report(run, opened.capture, metrics, story)
+    return metrics

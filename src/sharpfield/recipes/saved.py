@@ -1,0 +1,91 @@
+"""What a run was started with, as JSON beside it: recipe, options, capture, seed."""
+
+import dataclasses
+import json
+import types
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sharpfield.core.errors import RunError
+from sharpfield.core.files import replacing
+from sharpfield.recipes import recipe_named
+
+FILE = "recipe.json"
+
+
+@dataclass(frozen=True)
+class Started:
+    """Everything needed to build a run's model again."""
+
+    name: str
+    """Of the recipe."""
+    recipe: Any
+    """With all its numbers."""
+    capture: str
+    """Folder it was trained on."""
+    seed: int
+    use: tuple[str, ...] = ("frames", "events")
+    """Which streams of the capture were used."""
+
+    def settings(self) -> dict[str, Any]:
+        """As JSON; the length of the schedule is the run's own."""
+        return {
+            "recipe": self.name,
+            "capture": self.capture,
+            "seed": self.seed,
+            "use": list(self.use),
+            "options": dataclasses.asdict(self.recipe),
+        }
+
+
+def write_started(run: Path, started: Started) -> None:
+    """Write `RUN/recipe.json`."""
+    with replacing(run / FILE) as temporary:
+        temporary.write_text(json.dumps(started.settings(), indent=2) + "\n")
+
+
+def read_started(run: Path) -> Started:
+    """Read `RUN/recipe.json`.
+
+    Raises:
+        RunError: It is missing or damaged, or names an option this version does not know.
+    """
+    path = run / FILE
+    try:
+        table = json.loads(path.read_text())
+        recipe = from_table(recipe_named(table["recipe"]), table["options"])
+        return Started(
+            table["recipe"], recipe, table["capture"], int(table["seed"]), tuple(table["use"])
+        )
+    except FileNotFoundError:
+        raise RunError(
+            "this is not a run", where=run, got=f"no {FILE}", do="name a folder that `train` made"
+        ) from None
+    except (ValueError, TypeError, KeyError) as error:
+        raise RunError("cannot be read", where=path, got=error, do="train anew") from None
+
+
+def from_table(kind: type, table: dict[str, Any]) -> Any:
+    """A dataclass from nested plain values; unknown keys are errors.
+
+    Raises:
+        KeyError: The table names something the dataclass does not have.
+    """
+    hints = typing.get_type_hints(kind)
+    fields = {f.name for f in dataclasses.fields(kind)}
+    if unknown := table.keys() - fields:
+        raise KeyError(f"{kind.__name__} has no option {', '.join(sorted(unknown))}")
+    return kind(**{name: _value(hints[name], value) for name, value in table.items()})
+
+
+def _value(hint: Any, value: Any) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_table(typing.cast(type, hint), value)
+    if isinstance(value, list):
+        return tuple(value)
+    if typing.get_origin(hint) in (types.UnionType, typing.Union) and isinstance(value, dict):
+        kinds = [k for k in typing.get_args(hint) if dataclasses.is_dataclass(k)]
+        return from_table(typing.cast(type, kinds[0]), value)
+    return value
