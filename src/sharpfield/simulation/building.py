@@ -11,10 +11,12 @@ from jaxtyping import Float64
 from sharpfield.simulation.surfaces import BALL, BOX, RECTANGLE, Surfaces
 from sharpfield.simulation.textures import SOLID, TEXT, page
 
-Vector = tuple[float, float, float]
+Real = float | int
+"""Whole numbers may be written without a point; checks at run time tell the two apart."""
+Vector = tuple[Real, Real, Real]
 
 FLAT: Vector = (90.0, 0.0, 0.0)
-"""Turns a rectangle so that it faces up: a floor."""
+"""Lays a rectangle down: a floor."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +28,10 @@ class Paint:
     ink: str = "#202020"
     accent: str = "#ffffff"
     texture: int = SOLID
-    cells: float = 1.0
+    cells: Real = 1.0
     """Repetitions of the texture in one world unit."""
     seed: int = 0
-    slant: float = 0.0
+    slant: Real = 0.0
     text: str = ""
     """Lettering instead of a texture; on the front of a box or rectangle."""
 
@@ -45,30 +47,30 @@ class Surface:
     turn: Vector = (0.0, 0.0, 0.0)
     """Pitch about x, yaw about y, roll about z, in degrees."""
     throws_shadow: bool = True
-    sway: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0)
     """How far the centre swings (x, y, z), and the period in seconds."""
 
 
 def rectangle(
     centre: Vector,
-    size: tuple[float, float],
+    size: tuple[Real, Real],
     paint: Paint,
     *,
     turn: Vector = (0.0, 0.0, 0.0),
     throws_shadow: bool = True,
 ) -> Surface:
-    """A flat picture of `size` (width, height) that faces the camera unless turned."""
+    """A flat picture of `size` (width, height), upright and facing the camera unless turned."""
     half = (size[0] / 2, size[1] / 2, 0.0)
     return Surface(RECTANGLE, centre, half, paint, turn, throws_shadow)
 
 
 def ball(
     centre: Vector,
-    radius: float,
+    radius: Real,
     paint: Paint,
     *,
     turn: Vector = (0.0, 0.0, 0.0),
-    sway: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
 ) -> Surface:
     """A ball."""
     return Surface(BALL, centre, (radius, radius, radius), paint, turn, sway=sway)
@@ -80,7 +82,7 @@ def box(
     paint: Paint,
     *,
     turn: Vector = (0.0, 0.0, 0.0),
-    sway: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0),
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
 ) -> Surface:
     """A box of `size` (width, height, depth)."""
     half = (size[0] / 2, size[1] / 2, size[2] / 2)

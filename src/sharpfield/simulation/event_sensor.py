@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt64
 
 from sharpfield.core.errors import OptionError
-from sharpfield.core.seed import number, numpy_generator
+from sharpfield.core.seed import numpy_generator
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Rec.601 weights, applied to linear RGB."""
@@ -119,10 +119,7 @@ class Pixels(NamedTuple):
 
 
 def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int) -> Pixels:
-    """Draw a sensor's pixels, looking at light of a first log `level`.
-
-    What a pixel draws depends on the seed and its index alone.
-    """
+    """Draw a sensor's pixels, looking at light of a first log `level`."""
     n = len(level)
     draw = numpy_generator(seed, 0, "event pixels")
     spread = sensor.threshold_sigma * draw.standard_normal((2, n))
@@ -134,7 +131,6 @@ def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int)
     reference = level.copy()
     if sensor.start == "random":
         reference += off - place * (on + off)
-    indices = np.arange(n, dtype=np.uint64) + np.uint64(number(seed, 0, "event noise"))
     return Pixels(
         on=on,
         off=off,
@@ -142,7 +138,7 @@ def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int)
         reference=reference,
         ready_ns=np.full(n, np.iinfo(np.int64).min),
         hazard=draw.standard_exponential(n),
-        random=indices * np.uint64(0x9E3779B97F4A7C15),
+        random=draw.integers(0, 2**64, n, dtype=np.uint64),
     )
 
 

@@ -111,10 +111,11 @@ class EventPixels:
         before, self._target = self._target, target
         if not self.sensor.cutoff_hz:
             return target
-        share = DARK_SPEED + (1 - DARK_SPEED) * np.clip(light.reshape(-1), 0, 1)
+        share = DARK_SPEED + (1 - DARK_SPEED) * np.clip(light.reshape(-1), 0, 1).astype(np.float64)
         gap = 2 * np.pi * self.sensor.cutoff_hz * share * (1e-9 * gap_ns)  # in time constants
-        lag = (target - before) / gap
-        return target - lag + (self._level - before + lag) * np.exp(-gap)
+        passed = -np.expm1(-gap)  # share of a step that has got through
+        lag = (target - before) / gap * passed
+        return target - lag + (self._level - before) * (1 - passed)
 
 
 def watch(

@@ -184,7 +184,7 @@ def simulate_footage(
             )
         recorder.see(rgb, t_us)
     return Capture(
-        camera=Camera(width, height, width, width, width / 2, height / 2),
+        camera=Camera(width, height, float(width), float(width), width / 2, height / 2),
         trajectory=Still(np.eye(3, 4)[None]),
         clock=Clock(int(times[0]), int(times[-1] - times[0])),
         near=1.0,

@@ -66,8 +66,8 @@ def _garden() -> Parts:
     azulejo = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 3.2)
     parts = [
         rectangle(
-            (0, -2.2, 7.0),
-            (16, 6.4),
+            (0, -1.95, 7.0),
+            (16, 6.5),
             Paint("#1f4d2b", "#86b94e", "#e5d36b", LEAVES, 2.6, 3),
             throws_shadow=False,
         ),
@@ -109,7 +109,7 @@ def _garden() -> Parts:
             turn=(0, 10, 5),
         ),
     ]
-    return parts, 2.0, 9.0, 0.45
+    return parts, 2.0, 8.0, 0.45
 
 
 def _shelf() -> Parts:

@@ -5,7 +5,8 @@ A texture says, at a place (u, v) on a surface, how much of a second colour (`in
 than a pixel fade to their mean, so pictures have no aliasing, and light stays a smooth function
 of the ray, however small the image.
 
-Everything here is compiled and called once per ray; lengths are world units.
+Everything here is compiled and called once per ray; lengths are world units. It is compiled into
+`surfaces.trace`, whose cache does not notice a change in this file: run `make clean` after one.
 """
 
 from math import cos, floor, hypot, sin
@@ -56,6 +57,13 @@ def soft(distance, width):
     """0 outside, 1 inside, smooth over one `width` around the edge where `distance` is 0."""
     t = min(max(distance / width + 0.5, 0.0), 1.0)
     return t * t * (3.0 - 2.0 * t)
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def band(distance, half, width):
+    """Share of a pixel that a line covers, however thin; `distance` is from its middle."""
+    return soft(half - distance, width) - soft(-half - distance, width)
 
 
 @njit(cache=True, fastmath=True)
@@ -175,8 +183,8 @@ def _tiles(u, v, width, seed):
     petals = soft(0.26 + 0.11 * (four if (i + j) & 1 else -four) - radius, width)
     heart = soft(0.09 - radius, width)
     corner = hypot(0.5 - abs(x), 0.5 - abs(y))
-    arcs = soft(0.06 - abs(corner - 0.27), width)
-    grout = soft(0.025 - (0.5 - max(abs(x), abs(y))), width)
+    arcs = band(abs(corner - 0.27), 0.06, width)
+    grout = band(0.5 - max(abs(x), abs(y)), 0.025, width)
     ink = max(petals * (1.0 - heart), 0.55 * grout)
     accent = max(arcs * (1.0 - ink), heart) * (0.75 + 0.25 * _random(i, j, seed))
     keep = kept(width, 0.5)
@@ -192,7 +200,7 @@ def _bricks(u, v, width, seed):
     column = int(floor(shifted))
     x, y = shifted - column, 2.0 * v - row
     to_edge = min(min(x, 1.0 - x), 0.5 * min(y, 1.0 - y))
-    mortar = soft(0.035 - to_edge, width)
+    mortar = band(to_edge, 0.035, width)
     shade = 0.75 * _random(column, row, seed) + 0.25 * _noise(6.0 * u, 6.0 * v, 6.0 * width, seed)
     keep = kept(width, 0.6)
     mortar = 0.15 + (mortar - 0.15) * keep
@@ -218,7 +226,7 @@ def _leaves(u, v, width, seed):
                 across = cos(turn) * y - sin(turn) * x
                 half = 0.27 * (1.0 - (along / 0.62) ** 2)
                 cover = soft(half - abs(across), width)
-                rib = soft(0.025 - abs(across), width) * 0.5
+                rib = band(abs(across), 0.025, width) * 0.5
                 shade = 0.3 + 0.7 * _random(a, b, s + 3) - rib
                 turned = 0.8 if _random(a, b, s + 4) > 0.86 else 0.0
                 ink += cover * (shade * (1.0 - turned) - ink)
