@@ -24,8 +24,8 @@ from sharpfield.training.optim import module_of
 
 SHARE = 0.7
 """Part of the available memory that training may take."""
-TRANSIENT = 1.4
-"""Peak over kept bytes: what forward and backward hold only for a moment comes on top."""
+TRANSIENT = 1.6
+"""Peak over kept bytes: what is held only for a moment comes on top (1.5 with Ev-DeblurNeRF)."""
 SLICES = (16, 8)
 """The kept bytes are measured on this fraction of a batch."""
 COPIES = 3
