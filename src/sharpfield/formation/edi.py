@@ -83,7 +83,7 @@ def published_slices(
         )
         for part in (events[int(a) : int(b)] for a, b in zip(first, last, strict=True))
     ]
-    return torch.from_numpy(np.stack(slices)).float()
+    return torch.as_tensor(np.stack(slices), dtype=torch.float32)
 
 
 def published(

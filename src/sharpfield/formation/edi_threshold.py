@@ -33,6 +33,9 @@ LOWEST, HIGHEST = 0.02, 1.2
 COARSE = 10
 """Thresholds tried before the best one's neighbourhood is searched."""
 
+SILENT = 0.02
+"""Share of pixels without events that is enough to tell a change of gain."""
+
 GOLDEN = (math.sqrt(5) - 1) / 2
 
 Cost = Callable[[FixedThresholds], float]
@@ -46,23 +49,26 @@ def disagreement(
 ) -> float:
     """Mean distance, in log light, between what neighbouring exposures say of each other.
 
-    A common factor between two frames (gain, exposure) is taken out first.
+    Pixels without events tell what gain or exposure time changed between two frames; that factor
+    is taken out first. All others are judged.
 
     Args:
         light: Of the blurred frames, linear: luma, or the colours that the paths tell apart.
         paths: Of each exposure, with its middle as the first instant.
         gaps: Change of log light from each middle to the next, g = n - 1.
-        usable: Pixels that are neither too dark nor saturated and have seen events.
+        usable: Pixels that are neither too dark nor saturated.
     """
-    moved = torch.stack([path.change[0] - path.log_mean for path in paths])
-    alone = (light + FLOOR).log() + moved
+    moved = torch.stack([path.log_mean != 0 for path in paths])
+    moved = moved[1:] | moved[:-1] | (gaps != 0)
+    log_ratio = torch.stack([path.change[0] - path.log_mean for path in paths])
+    alone = (light + FLOOR).log() + log_ratio
     apart = alone[1:] - alone[:-1] - gaps
     total, count = 0.0, 0
-    for distance, good in zip(apart, usable[1:] & usable[:-1], strict=True):
-        if good.any():
-            seen = distance[good]
-            total += float((seen - seen.median()).abs().sum())
-            count += len(seen)
+    for distance, active, good in zip(apart, moved, usable[1:] & usable[:-1], strict=True):
+        silent, judged = distance[good & ~active], distance[good & active]
+        gain = silent.median() if len(silent) >= SILENT * distance.numel() else 0.0
+        total += float((judged - gain).abs().sum())
+        count += len(judged)
     return total / count if count else math.inf
 
 

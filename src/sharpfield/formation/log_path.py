@@ -112,11 +112,11 @@ def follow(
     change = np.empty((len(instants_us), *spread.size))
     begin = 0
     for k, instant in enumerate(instants_us):
-        end = int(np.searchsorted(steps.t_us, instant, side="right"))
+        end = int(np.searchsorted(steps.t_us, int(instant), side="right"))
         progress = progress.after(steps[begin:end], spread)
         change[k], begin = progress.level, end
     log_mean = progress.after(steps[begin:], spread).log_mean(opens, closes)
-    return LogPath(torch.from_numpy(log_mean).float(), torch.from_numpy(change).float())
+    return LogPath(_tensor(log_mean), _tensor(change))
 
 
 def change_between(
@@ -130,7 +130,11 @@ def change_between(
     """Change of log light from after the first time up to and including the second."""
     steps = _steps(events, window_us, thresholds, channel)
     progress = _Progress.at_rest(spread, window_us[0]).after(steps, spread)
-    return torch.from_numpy(progress.level).float()
+    return _tensor(progress.level)
+
+
+def _tensor(values: Float64[np.ndarray, "*b"]) -> Float[Tensor, "*b"]:
+    return torch.as_tensor(values, dtype=torch.float32)
 
 
 @dataclass(frozen=True)

@@ -118,8 +118,7 @@ class _PairJudge:
             for window, middle in zip(self.windows_us, self.middles_us, strict=True)
         ]
         gap = self.motion.between(self.middles_us[0], self.middles_us[1], thresholds)
-        moved = torch.stack([path.log_mean != 0 for path in paths])
-        usable = moved & (self.light > DARK) & (self.light < BRIGHT)
+        usable = (self.light > DARK) & (self.light < BRIGHT)
         return disagreement(self.light, paths, gap[None], usable)
 
 
