@@ -19,6 +19,9 @@ LENSES = {"pinhole": 0, "brown": 5, "fisheye": 4}
 UNDISTORT_STEPS = 12
 """Newton steps; real lenses need four or five for float32."""
 
+AXIS = 1e-9
+"""Distance from the optical axis below which a direction is along it."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -156,16 +159,19 @@ def _invert_brown(
 def _fisheye_plane(
     points: Float[Tensor, "*b 3"], coefficients: tuple[float, ...]
 ) -> Float[Tensor, "*b 2"]:
-    sideways = points[..., :2].norm(dim=-1)
-    theta = torch.atan2(sideways, points[..., 2])
-    bent = _fisheye_angle(theta, coefficients)
-    scale = torch.where(sideways > 1e-9, bent / sideways.clamp_min(1e-9), 1 / points[..., 2])
+    """Where points fall on the plane z = 1 of a lens whose radius grows with the angle."""
+    sideways, forward = points[..., :2].norm(dim=-1), points[..., 2]
+    bent = _fisheye_angle(torch.atan2(sideways, forward), coefficients)
+    # Both branches stay finite, also in their gradients, where the other one is taken.
+    on_axis = 1 / forward.clamp_min(AXIS)
+    scale = torch.where(sideways > AXIS, bent / sideways.clamp_min(AXIS), on_axis)
     return points[..., :2] * scale[..., None]
 
 
 def _fisheye_angle(
     theta: Float[Tensor, "*b"], coefficients: tuple[float, ...]
 ) -> Float[Tensor, "*b"]:
+    """Distance from the centre of the plane at an angle from the axis (Kannala-Brandt)."""
     k1, k2, k3, k4 = coefficients
     t2 = theta * theta
     return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
@@ -174,6 +180,7 @@ def _fisheye_angle(
 def _fisheye_direction(
     plane: Float[Tensor, "*b 2"], coefficients: tuple[float, ...]
 ) -> Float[Tensor, "*b 3"]:
+    """Unit directions that fall on positions of the plane, by Newton's method on the angle."""
     k1, k2, k3, k4 = coefficients
     bent = plane.norm(dim=-1)
     theta = bent
@@ -181,5 +188,5 @@ def _fisheye_direction(
         t2 = theta * theta
         slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
         theta = theta - (_fisheye_angle(theta, coefficients) - bent) / slope
-    scale = torch.where(bent > 1e-9, theta.sin() / bent.clamp_min(1e-9), torch.ones_like(bent))
+    scale = torch.where(bent > AXIS, theta.sin() / bent.clamp_min(AXIS), torch.ones_like(bent))
     return torch.cat([plane * scale[..., None], theta.cos()[..., None]], -1)

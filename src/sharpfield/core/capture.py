@@ -34,8 +34,9 @@ class Clock:
         return np.asarray((np.asarray(t_us, np.int64) - self.origin_us) / self.span_us)
 
     def us(self, unit: Float[np.ndarray, "*n"] | float) -> Int64[np.ndarray, "*n"]:
-        """Back to us, rounded."""
-        return np.asarray(np.rint(np.asarray(unit) * self.span_us).astype(np.int64)) + self.origin_us
+        """Back to us, rounded; an array also for a single time."""
+        since = np.rint(np.asarray(unit) * self.span_us).astype(np.int64)
+        return np.asarray(since + self.origin_us)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What one training step looks at: pixels of frames, pairs of events. All tensors, on the device."""
+"""What one training step looks at: pixels of frames and pairs of events, as tensors."""
 
 from dataclasses import dataclass
 from typing import ClassVar

@@ -33,7 +33,12 @@ class Trajectory(Protocol):
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
     ) -> Float[Tensor, "*b 3 4"]:
-        """World-from-camera, OpenCV axes; `time` is 0...1 of the capture, clamped to what is known."""
+        """World-from-camera, OpenCV axes.
+
+        Args:
+            time: 0...1 of the capture; clamped to the times with a known pose.
+            track: Whose camera.
+        """
         ...
 
     def known_us(self, track: int) -> tuple[int, int] | None:

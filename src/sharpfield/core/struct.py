@@ -40,13 +40,13 @@ class Struct:
     def __getitem__(self: S, index: Any) -> S:
         """Index the leading axes; every field keeps its trailing axes whole."""
         index = index if isinstance(index, tuple) else (index,)
-        return self.map(
-            lambda tensor, trailing: (
-                tensor[(*index, *([slice(None)] * trailing))]
-                if Ellipsis in [i for i in index if not isinstance(i, Tensor)]
-                else tensor[index]
-            )
-        )
+        reaches_last = any(part is Ellipsis for part in index)
+
+        def pick(tensor: Tensor, trailing: int) -> Tensor:
+            whole = [slice(None)] * trailing if reaches_last else []
+            return tensor[(*index, *whole)]
+
+        return self.map(pick)
 
     def reshape(self: S, *shape: int) -> S:
         """Give the leading axes another shape."""

@@ -175,7 +175,7 @@ class PlaneField(nn.Module):
         new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],
     ) -> Float[Tensor, "*b t g"]:
-        """Features of both volumes; those of the coarse one at old points are not looked up again."""
+        """Features of both volumes; the coarse one's at old points are taken from `looked`."""
         wide = torch.cat([looked, self.volumes[0](new)], -2)
         close = self.volumes[1](torch.cat([old, new], -2))
         return torch.cat([wide, close], -1)

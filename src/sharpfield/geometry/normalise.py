@@ -1,4 +1,4 @@
-"""A capture in a space of its own: near things at a fixed depth, the average camera at the origin."""
+"""A capture in a space of its own: near things 4/3 away, the average camera at the origin."""
 
 import dataclasses
 

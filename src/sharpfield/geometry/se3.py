@@ -1,4 +1,4 @@
-"""Rigid motions as `[*b 3 4]` tensors: rotation in the first three columns, translation in the last.
+"""Rigid motions as `[*b 3 4]` tensors: three columns of rotation, then the translation.
 
 `world_from_camera` maps camera coordinates to world coordinates. A twist is six numbers, first
 the rotation vector (rad), then the translational part; `exp` maps it to a motion. Everything is

@@ -70,8 +70,10 @@ def _second_derivatives(
 
 
 def bspline_weights(u: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4"]:
-    """Weights of four neighbouring knots in a uniform cubic B-spline; u in 0...1 between the
-    middle two. They sum to one.
+    """Weights of four neighbouring knots in a uniform cubic B-spline; they sum to one.
+
+    Args:
+        u: Place between the middle two knots, 0...1.
     """
     u2, u3 = u * u, u * u * u
     return (
