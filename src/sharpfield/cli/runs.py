@@ -15,7 +15,16 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.evaluation import Measuring, Story, evaluate, write_report
 from sharpfield.recipes.saved import Started, read_started, write_started
-from sharpfield.training import Ledger, Options, file_of, load, read_ledger, restore_weights, train
+from sharpfield.training import (
+    Ledger,
+    Options,
+    file_of,
+    load,
+    read_ledger,
+    require_unused,
+    restore_weights,
+    train,
+)
 
 STREAMS = ("frames", "events")
 
@@ -76,9 +85,15 @@ def start(
         return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
 
     if not options.resume:
+        require_unused(run)
         write_started(run, started)
     return train(
-        build, run, options, steps=started.recipe.steps, settings=started.settings(), console=console
+        build,
+        run,
+        options,
+        steps=started.recipe.steps,
+        settings=started.settings(),
+        console=console,
     )
 
 

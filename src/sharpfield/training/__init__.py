@@ -10,7 +10,7 @@ from sharpfield.training.memory import plan_parts
 from sharpfield.training.optim import adam, set_rates
 from sharpfield.training.plan import Build, Options, Plan
 from sharpfield.training.record import Ledger, read_ledger
-from sharpfield.training.train import train
+from sharpfield.training.train import require_unused, train
 
 __all__ = [
     "Build",
@@ -29,6 +29,7 @@ __all__ = [
     "load",
     "plan_parts",
     "read_ledger",
+    "require_unused",
     "restore_weights",
     "set_rates",
     "train",

@@ -91,17 +91,26 @@ def train(
     return record.ledger
 
 
+def require_unused(run: Path) -> None:
+    """Refuse a folder in which training has begun before.
+
+    Raises:
+        RunError: It has.
+    """
+    if (run / "training.json").exists():
+        raise RunError(
+            "the folder already holds a run",
+            where=run,
+            do="go on with it by --resume, or name another folder",
+        )
+
+
 def _resumed(
     run: Path, options: Options, settings: Mapping[str, Any], console: Console
 ) -> Checkpoint | None:
     """The state to go on from; None for a run that starts at its beginning."""
     if not options.resume:
-        if (run / "training.json").exists():
-            raise RunError(
-                "the folder already holds a run",
-                where=run,
-                do="go on with it by --resume, or name another folder",
-            )
+        require_unused(run)
         return None
     saved, warning = recover(run)
     if warning:
