@@ -22,8 +22,9 @@ def made(*parts, ambient: float = 1.0) -> Scene:
 def test_scenes_are_within_their_bounds(name):
     place = scene(name)
     for path in MOTIONS:
-        for pose in motion(path, 1).poses(np.arange(0, 1_000_000, 90_000)):
-            rgb, depth = view(place, SMALL, pose)
+        times = np.arange(0, 1_000_000, 90_000)
+        for t_us, pose in zip(times, motion(path, 1).poses(times), strict=True):
+            rgb, depth = view(place, SMALL, pose, 1e-6 * float(t_us))
             assert rgb.dtype == np.float32 and rgb.min() >= np.float32(DARKEST) and rgb.max() <= 1
             assert place.near < depth.min() and depth.max() < place.far
             display = rgb ** (1 / 2.2)
@@ -122,6 +123,12 @@ def test_what_sways_moves_and_comes_back():
     across = np.array([[0.0, 0, 1], [0.25, 0, 1]])
     seen = [place.light(np.zeros((1, 3)), across, t)[1] < 10 for t in (0.0, 0.5, 1.0, 2.0)]
     assert [list(s) for s in seen] == [[1, 0], [0, 1], [1, 0], [1, 0]]
+
+
+def test_only_the_mobile_moves():
+    for name in SCENES:
+        early, late = (view(scene(name), SMALL, HOME, t)[0] for t in (0.0, 0.2))
+        assert (early != late).any() == (name == "mobile")
 
 
 def test_letters_are_signed_distances():

@@ -70,7 +70,7 @@ def test_blur_is_there_and_linear(capture):
     linear, bent = mean ** (1 / 2.2), np.average(light ** (1 / 2.2), axis=0, weights=weight)
     stored = frames.images[5] / 255
     assert np.abs(stored - linear).max() < 0.51 / 255 and np.abs(stored - bent).max() > 1.5 / 255
-    assert np.abs(stored - frames.truth[5] / 255).mean() > 0.02
+    assert np.abs(stored - frames.truth[5] / 255).max() > 0.03  # about a pixel of motion
 
 
 def test_events_explain_the_change_between_sharp_views(capture):

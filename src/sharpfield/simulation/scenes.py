@@ -175,5 +175,42 @@ def _tiles() -> Parts:
     return parts, 2.0, 6.5, 0.55
 
 
-SCENES: dict[str, Callable[[], Parts]] = {"garden": _garden, "shelf": _shelf, "tiles": _tiles}
-"""Scenes by name."""
+def _mobile() -> Parts:
+    """Toys that swing before a brick wall, each with its own period."""
+    parts = [
+        rectangle(
+            (0, 0, 6.0),
+            (14, 10),
+            Paint("#8a4b3a", "#c98e6b", "#e6d9c6", BRICKS, 1.3),
+            throws_shadow=False,
+        ),
+        ball(
+            (-0.8, 0.3, 4.0),
+            0.5,
+            Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5),
+            sway=(0.45, 0.1, 0.0, 1.1),
+        ),
+        box(
+            (0.8, -0.2, 4.4),
+            (1.1, 1.1, 0.8),
+            Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 3.4),
+            turn=(0, 24, 0),
+            sway=(-0.2, 0.35, 0.2, 0.8),
+        ),
+        box(
+            (0.0, 0.95, 3.3),
+            (1.0, 0.4, 0.3),
+            Paint("#24476b", "#f6e7b4", text="SWING"),
+            sway=(0.3, 0.0, 0.2, 1.6),
+        ),
+    ]
+    return parts, 2.0, 6.5, 0.5
+
+
+SCENES: dict[str, Callable[[], Parts]] = {
+    "garden": _garden,
+    "shelf": _shelf,
+    "tiles": _tiles,
+    "mobile": _mobile,
+}
+"""Scenes by name; all stand still but "mobile"."""
