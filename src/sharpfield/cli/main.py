@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             prog="sharpfield",
             description=ABOUT,
             args=list(sys.argv[1:] if arguments is None else arguments),
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagConversionOff),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
     except SharpfieldError as error:
         print(error, file=sys.stderr)

@@ -14,6 +14,11 @@ def constant(value: float) -> Schedule:
     return lambda step: value
 
 
+def scaled(schedule: Schedule, factor: float) -> Schedule:
+    """Another schedule times a number."""
+    return lambda step: factor * schedule(step)
+
+
 def linear(start: float, end: float, *, begin: int, until: int) -> Schedule:
     """`start` up to step `begin`, `end` from step `until`, straight in between."""
     return lambda step: start + (end - start) * _progress(step, begin, until)

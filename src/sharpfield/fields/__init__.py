@@ -2,5 +2,6 @@
 
 from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.plane_grid import HeadSize, PlaneField, Volume
+from sharpfield.fields.voxel_grid import VoxelGrid
 
-__all__ = ["HeadSize", "MLPField", "PlaneField", "Volume"]
+__all__ = ["HeadSize", "MLPField", "PlaneField", "Volume", "VoxelGrid"]

@@ -32,9 +32,14 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
             return path.poses
         start, end = (float(capture.clock.unit(t)) for t in known)
         time = torch.linspace(start, end, PATH_SAMPLES)
-        return capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES).long()).double().numpy()
+        return (
+            capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES).long())
+            .detach()
+            .double()
+            .numpy()
+        )
     every = np.arange(len(capture.needed_frames))
-    return capture.frame_pose(every).double().numpy()
+    return capture.frame_pose(every).detach().double().numpy()
 
 
 def normalised(capture: Capture) -> tuple[Capture, Similarity]:

@@ -33,7 +33,8 @@ def _coefficients(theta2: Float[Tensor, "*b"]) -> tuple[Tensor, Tensor, Tensor]:
     safe2 = torch.where(small, torch.ones_like(theta2), theta2)
     theta = safe2.sqrt()
     a = torch.where(small, 1 - theta2 / 6 + theta2**2 / 120, theta.sin() / theta)
-    b = torch.where(small, 0.5 - theta2 / 24 + theta2**2 / 720, (1 - theta.cos()) / safe2)
+    half = (theta / 2).sin()  # 1 - cos t would lose half the digits of small angles
+    b = torch.where(small, 0.5 - theta2 / 24 + theta2**2 / 720, 2 * half * half / safe2)
     c = torch.where(
         small, 1 / 6 - theta2 / 120 + theta2**2 / 5040, (theta - theta.sin()) / (safe2 * theta)
     )

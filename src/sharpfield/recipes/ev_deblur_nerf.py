@@ -19,13 +19,13 @@ from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group, cosine, exponential
+from sharpfield.core.schedule import Group, cosine, exponential, scaled
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.event_term import EventOptions, EventTerm
 from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, MotionTerm, Terms
 from sharpfield.recipes.learned_blur import KernelOptions, LearnedBlur, trust
 from sharpfield.recipes.prior import InstantsPrior, MiddlePrior, PriorOptions
-from sharpfield.recipes.volume import Volume, VolumeOptions
+from sharpfield.recipes.volume import Volume, VolumeOptions, stages
 
 PAPER = Paper(
     key="cannici2024evdeblurnerf",
@@ -62,6 +62,8 @@ class EvDeblurNeRF:
     """Length of the schedule."""
     rate: float = 5e-3
     """First learning rate of everything."""
+    grids_faster: float = 1.0
+    """Factor on the rate of planes and lines."""
     decay: int = 10_000
     """Steps in which it falls to a tenth."""
     smooth: float = 1.0
@@ -75,26 +77,26 @@ class EvDeblurNeRF:
     def lasting(self, steps: int) -> "EvDeblurNeRF":
         """The same recipe with its whole schedule stretched or shrunk to `steps`."""
 
-        def scaled(number: int) -> int:
+        def stretched(number: int) -> int:
             return max(round(number * steps / self.steps), 1)
 
         frames, events = self.frames, self.events
         return replace(
             self,
             steps=steps,
-            decay=scaled(self.decay),
+            decay=stretched(self.decay),
             frames=replace(
                 frames,
-                blur_from=scaled(frames.blur_from),
-                frames_from=scaled(frames.frames_from),
+                blur_from=stretched(frames.blur_from),
+                frames_from=stretched(frames.frames_from),
             ),
-            kernel=replace(self.kernel, trust_every=scaled(self.kernel.trust_every)),
+            kernel=replace(self.kernel, trust_every=stretched(self.kernel.trust_every)),
             events=replace(
                 events,
-                response_from=scaled(events.response_from),
-                colour_from=scaled(events.colour_from),
+                response_from=stretched(events.response_from),
+                colour_from=stretched(events.colour_from),
             ),
-            prior=replace(self.prior, until=scaled(self.prior.until)),
+            prior=replace(self.prior, until=stretched(self.prior.until)),
         )
 
     def build(self, capture: Capture, seed: int) -> "Model":
@@ -154,11 +156,10 @@ class Model(nn.Module):
     def _event_terms(self, events: EventTerm, seen: EventPairs, step: int) -> Terms:
         sensor = events.sensor(step)
         light = self.volume.sharp(sensor.expose(seen), step, "events")
-        assert light.coarse is not None
         errors = [
-            events.error(sensor.observe(stage, seen), seen, step) for stage in (light, light.coarse)
+            events.error(sensor.observe(stage, seen), seen, step) for stage in stages(light)
         ]
-        terms = {"events": self.recipe.events.weight * (errors[0] + errors[1])}
+        terms = {"events": self.recipe.events.weight * torch.stack(errors).sum()}
         if (prior := events.prior()) is not None:
             terms["thresholds"] = self.recipe.events.weight * 1e-2 * prior
         return terms
@@ -174,7 +175,7 @@ class Model(nn.Module):
     def groups(self) -> list[Group]:
         """Networks, grids, kernel and response, all at one rate."""
         kernel = tuple(self.frames.parameters()) if self.frames is not None else ()
-        groups = self.volume.groups(self.rate, *kernel)
+        groups = self.volume.groups(self.rate, scaled(self.rate, self.recipe.grids_faster), *kernel)
         return groups + (self.events.groups(self.rate) if self.events is not None else [])
 
     def _frame_term(self) -> KernelTerm | MotionTerm:

@@ -17,7 +17,7 @@ from sharpfield.formation.shutter import Pinhole, Shutter, expose_at
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.learned_blur import LearnedBlur
 from sharpfield.recipes.prior import InstantsPrior, MiddlePrior
-from sharpfield.recipes.volume import Volume
+from sharpfield.recipes.volume import Volume, stages
 
 Terms = dict[str, Tensor]
 
@@ -72,8 +72,7 @@ class FrameTerm(nn.Module):
 
     def stored_error(self, light: Radiance, target: Float[Tensor, "*b c"]) -> Float[Tensor, ""]:
         """Mean squared error of each ray's stored value, fine and coarse."""
-        assert light.coarse is not None
-        return mse(self.tone(light.rgb), target) + mse(self.tone(light.coarse.rgb), target)
+        return torch.stack([mse(self.tone(stage.rgb), target) for stage in stages(light)]).sum()
 
 
 class KernelTerm(FrameTerm):
@@ -142,9 +141,8 @@ class MotionTerm(FrameTerm):
         if not self.blurred(step):
             return self._early(volume, seen, step)
         light = volume.sharp(self.shutter.expose(seen), step, "frames")
-        assert light.coarse is not None
-        fine, coarse = (self.shutter.observe(x, seen) for x in (light, light.coarse))
-        terms = {"blur": mse(fine, seen.value) + mse(coarse, seen.value)}
+        errors = [mse(self.shutter.observe(stage, seen), seen.value) for stage in stages(light)]
+        terms = {"blur": torch.stack(errors).sum()}
         if self.prior is not None:
             error = self.stored_error(light, self.prior.target(seen))
             terms["prior"] = self.prior_weight(step) * error

@@ -16,6 +16,7 @@ from sharpfield.formation.adaptive import AdaptiveWeights
 from sharpfield.formation.mix import Curve
 from sharpfield.formation.rigid_kernel import RigidKernel, RigidMotions
 from sharpfield.losses.photometric import mse
+from sharpfield.recipes.volume import stages
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class LearnedBlur(nn.Module):
                 norm=options.norm,
                 generator=made,
             )
-            if options.adaptive
+            if options.adaptive and features
             else None
         )
 
@@ -101,6 +102,5 @@ class LearnedBlur(nn.Module):
         return terms
 
     def _error(self, light: Radiance, seen: Pixels) -> Float[Tensor, ""]:
-        assert light.coarse is not None
-        fine, coarse = (self.kernel.observe(x, seen) for x in (light, light.coarse))
-        return mse(fine, seen.value) + mse(coarse, seen.value)
+        errors = [mse(self.kernel.observe(stage, seen), seen.value) for stage in stages(light)]
+        return torch.stack(errors).sum()

@@ -16,7 +16,7 @@ from sharpfield.core.measurements import Batch, Pixels
 from sharpfield.core.paper import Paper
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group, constant, exponential
+from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, Terms
 from sharpfield.recipes.volume import Volume, VolumeOptions
@@ -49,6 +49,8 @@ class NeRF:
     """Length of the schedule."""
     rate: float = 5e-4
     """First learning rate."""
+    grids_faster: float = 1.0
+    """Factor on the rate of planes and lines."""
     decay: int = 250_000
     """Steps in which it falls to a tenth."""
     smooth: float = 0.0
@@ -112,4 +114,4 @@ class Model(nn.Module):
 
     def groups(self) -> list[Group]:
         """Networks and grids at one rate."""
-        return self.volume.groups(self.rate)
+        return self.volume.groups(self.rate, scaled(self.rate, self.recipe.grids_faster))

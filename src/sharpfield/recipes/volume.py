@@ -1,10 +1,11 @@
 """The sharp scene of the volumetric recipes: a capture in its own space, a field, a renderer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
@@ -12,22 +13,25 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
-from sharpfield.fields import HeadSize, MLPField, PlaneField
+from sharpfield.fields import HeadSize, MLPField, PlaneField, VoxelGrid
 from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
-from sharpfield.losses.regularizers import smoothness
+from sharpfield.losses.regularizers import roughness, smoothness
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
+from sharpfield.rendering.march import EvenSteps
 
 
 @dataclass(frozen=True)
 class VolumeOptions:
     """The field, and how rays sample it. Defaults: Ev-DeblurNeRF (CVPR 2024)."""
 
-    kind: Literal["planes", "mlp"] = "planes"
-    """Factored feature volumes with small networks, or NeRF's large networks alone."""
+    kind: Literal["planes", "mlp", "voxels"] = "planes"
+    """Factored feature volumes with small networks, NeRF's large networks alone, or a dense grid of
+    density and colour without any network."""
     voxels: tuple[int, int] = (16_777_248, 134_217_984)
-    """Resolution of the coarse and the fine volume: about 256^3 and 512^3."""
+    """Resolution of the coarse and the fine volume: about 256^3 and 512^3. A dense grid has the
+    second."""
     channels: tuple[int, int, int] = (64, 16, 16)
     """Features of the xy, xz and yz planes."""
     coarse: tuple[int, int, int] = (64, 15, 64)
@@ -37,7 +41,8 @@ class VolumeOptions:
     octaves: tuple[int, int] = (10, 4)
     """Frequencies in the encoding of position and of direction."""
     samples: tuple[int, int] = (64, 64)
-    """Coarse points on a ray, and fine points added to them."""
+    """Coarse points on a ray, and fine points added to them. A dense grid takes as many steps as
+    both together."""
     noise: float = 1.0
     """Standard deviation of the noise on raw density while training."""
     density: Literal["relu", "softplus"] = "relu"
@@ -77,26 +82,18 @@ class Volume(nn.Module):
         self.path = self.capture.trajectory
         poses = reference_poses(self.capture)
         self.space = _space(options, self.capture, poses)
-        made = generator(seed, 0, "field")
-        if options.kind == "mlp":
-            self.field = MLPField(generator=made)
-        else:
-            box = self.space.box(torch.from_numpy(poses).float())
-            self.field = PlaneField(
-                box,
-                options.voxels,
-                generator=made,
-                heads=(HeadSize(*options.coarse), HeadSize(*options.fine)),
-                channels=options.channels,
-                octaves=options.octaves,
-                precision=_precision(options.precision),
-            )
+        box = self.space.box(torch.from_numpy(poses).float())
+        self.field = _field(options, box, seed)
+        if isinstance(self.field, VoxelGrid):
+            self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
+            self.view = self.train_view
+            return
         how = Compositing(
             activation=ACTIVATIONS[options.density],
             opaque_end=isinstance(self.space, Frustum),
             background=options.background,
         )
-        clear = Compositing(**{**vars(how), "clear_before": options.clear_before})
+        clear = replace(how, clear_before=options.clear_before)
         self.train_view = CoarseToFine(self.field, self.space, options.samples, options.noise, how)
         self.view = CoarseToFine(self.field, self.space, options.samples, 0.0, clear)
 
@@ -107,8 +104,9 @@ class Volume(nn.Module):
 
     @property
     def feature_width(self) -> int:
-        """Width of the fine head's hidden features."""
-        return 256 if self.options.kind == "mlp" else self.options.fine[1]
+        """Width of the features along rays; 0 if there are none."""
+        widths = {"planes": self.options.fine[1], "mlp": 256, "voxels": 0}
+        return widths[self.options.kind]
 
     def sharp(self, rays: Rays, step: int, stream: str, *, samples: bool = False) -> Radiance:
         """Light along rays while training: jittered and noisy, by seed, step and stream."""
@@ -117,16 +115,47 @@ class Volume(nn.Module):
 
     def smoothness(self) -> Tensor:
         """Total variation of the planes and lines; zero without any."""
+        if isinstance(self.field, VoxelGrid):
+            return roughness(self.field.cells)
         planes, lines = self.field.planes(), self.field.lines()
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
-    def groups(self, rate: Schedule, *more: nn.Parameter) -> list[Group]:
+    def groups(self, rate: Schedule, grids_rate: Schedule, *more: nn.Parameter) -> list[Group]:
         """Parameters of grids and of networks, the latter with others that learn like them."""
-        grids = (*self.field.planes(), *self.field.lines())
+        if isinstance(self.field, VoxelGrid):
+            grids: tuple[nn.Parameter, ...] = (self.field.cells,)
+        else:
+            grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}
         networks = [p for p in self.field.parameters() if id(p) not in known]
-        groups = [Group("networks", (*networks, *more), rate)]
-        return [*groups, Group("grids", grids, rate)] if grids else groups
+        groups = [
+            Group("networks", (*networks, *more), rate), Group("grids", grids, grids_rate)
+        ]
+        return [group for group in groups if group.parameters]
+
+
+def stages(light: Radiance) -> list[Radiance]:
+    """The light as the fine stage sees it, and as the coarse one does where there are two."""
+    return [light] if light.coarse is None else [light, light.coarse]
+
+
+def _field(
+    options: VolumeOptions, box: Float[Tensor, "2 3"], seed: int
+) -> PlaneField | MLPField | VoxelGrid:
+    if options.kind == "voxels":
+        return VoxelGrid(box, options.voxels[1])
+    made = generator(seed, 0, "field")
+    if options.kind == "mlp":
+        return MLPField(generator=made)
+    return PlaneField(
+        box,
+        options.voxels,
+        generator=made,
+        heads=(HeadSize(*options.coarse), HeadSize(*options.fine)),
+        channels=options.channels,
+        octaves=options.octaves,
+        precision=_precision(options.precision),
+    )
 
 
 def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space:

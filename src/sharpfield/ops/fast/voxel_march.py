@@ -1,0 +1,236 @@
+# pyright: basic
+"""Marching through a voxel grid on the CPU: one pass forwards, and one back that keeps nothing.
+
+Rays are cut into PARTS shares with a gradient grid each, which are added at the end, so that sums
+do not depend on the number of threads. A ray ends once next to nothing gets through.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.voxel_march import THIN, march
+
+PARTS = 2
+"""Shares of the rays with a gradient of their own: a constant, see above."""
+
+DARK = 1e-5
+"""A ray ends when less than this share of light gets through."""
+
+
+@march.accelerate("cpu", needs="numba")
+def _(
+    grid: Float[Tensor, "d h w 4"],
+    origin: Float[Tensor, "b 3"],
+    direction: Float[Tensor, "b 3"],
+    place: Float[Tensor, "b s"],
+    *,
+    opaque_end: bool = True,
+) -> Float[Tensor, "b 5"]:
+    if origin.requires_grad or direction.requires_grad or grid.dtype != torch.float32:
+        return march.reference(grid, origin, direction, place, opaque_end=opaque_end)
+    rays = [x.detach().contiguous() for x in (origin, direction, place)]
+    return _March.apply(grid.contiguous(), *rays, opaque_end)
+
+
+class _March(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, grid: Tensor, origin: Tensor, direction: Tensor, place: Tensor, opaque_end: bool
+    ) -> Tensor:
+        ctx.save_for_backward(grid, origin, direction, place)
+        ctx.opaque_end = opaque_end
+        out = torch.empty(len(origin), 5)
+        rays = (memory(origin), memory(direction), memory(place))
+        spread(_forward, memory(grid), *rays, opaque_end, memory(out))
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        grid, origin, direction, place = ctx.saved_tensors
+        sums = np.zeros((PARTS, *grid.shape), np.float32)
+        rays = (memory(origin), memory(direction), memory(place))
+        wanted = memory(gradients[0].contiguous())
+        spread(_backward, memory(grid), *rays, ctx.opaque_end, wanted, sums)
+        sums[0] += sums[1]
+        return torch.from_numpy(sums[0]), None, None, None, None
+
+
+@kernel
+def _locate(grid, x, y, z, corner, weight):
+    """The cell below a point along each axis, and the share of the next one; False outside."""
+    depth, height, width = grid.shape[0], grid.shape[1], grid.shape[2]
+    if not (-1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0):
+        return False
+    px = (x + 1.0) * 0.5 * (width - 1)
+    py = (y + 1.0) * 0.5 * (height - 1)
+    pz = (z + 1.0) * 0.5 * (depth - 1)
+    corner[0] = min(int(px), width - 2)
+    corner[1] = min(int(py), height - 2)
+    corner[2] = min(int(pz), depth - 2)
+    weight[0] = np.float32(px - corner[0])
+    weight[1] = np.float32(py - corner[1])
+    weight[2] = np.float32(pz - corner[2])
+    return True
+
+
+@kernel
+def _look(grid, corner, weight, found):
+    """Trilinear values at a located point."""
+    a = b = c = d = np.float32(0.0)
+    for k in range(2):
+        wz = weight[2] if k else np.float32(1.0) - weight[2]
+        for j in range(2):
+            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
+            for i in range(2):
+                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
+                a += w * cell[0]
+                b += w * cell[1]
+                c += w * cell[2]
+                d += w * cell[3]
+    found[0], found[1], found[2], found[3] = a, b, c, d
+
+
+@kernel
+def _softplus(raw):
+    return raw if raw > 15.0 else math.log1p(math.exp(raw))
+
+
+@kernel
+def _sigmoid(raw):
+    return 1.0 / (1.0 + math.exp(-raw))
+
+
+@kernel
+def _walk(grid, origin, direction, place, opaque_end, trace, corner, weight, found):
+    """Fill the trace of one ray; returns how many samples it has.
+
+    Columns of the trace: number of the sample, opacity, weight, softplus' slope, three colours.
+    """
+    samples = len(place)
+    clear = 1.0
+    kept = 0
+    for s in range(samples):
+        last = opaque_end and s == samples - 1
+        z = place[s]
+        inside = _locate(
+            grid,
+            origin[0] + z * direction[0],
+            origin[1] + z * direction[1],
+            origin[2] + z * direction[2],
+            corner,
+            weight,
+        )
+        if inside:
+            _look(grid, corner, weight, found)
+        elif last:
+            found[:] = 0.0
+        else:
+            continue
+        raw = found[0] + THIN
+        alpha = 1.0 if last else 1.0 - math.exp(-_softplus(raw))
+        row = trace[kept]
+        row[0] = s
+        row[1] = alpha
+        row[2] = clear * alpha
+        row[3] = 0.0 if last else _sigmoid(raw)
+        row[4] = _sigmoid(found[1])
+        row[5] = _sigmoid(found[2])
+        row[6] = _sigmoid(found[3])
+        kept += 1
+        clear *= 1.0 - alpha
+        if clear < DARK:
+            break
+    return kept
+
+
+@kernel
+def _forward(worker, workers, grid, origin, direction, place, opaque_end, out):
+    """Colour, depth and opacity of a share of the rays."""
+    trace = np.empty((place.shape[1], 7))
+    corner, weight = np.empty(3, np.int64), np.empty(3, np.float32)
+    found = np.empty(4, np.float32)
+    for ray in range(*share(worker, workers, len(out))):
+        kept = _walk(
+            grid, origin[ray], direction[ray], place[ray], opaque_end, trace, corner, weight, found
+        )
+        red = green = blue = depth = opacity = 0.0
+        for k in range(kept):
+            w = trace[k, 2]
+            red += w * trace[k, 4]
+            green += w * trace[k, 5]
+            blue += w * trace[k, 6]
+            depth += w * place[ray, int(trace[k, 0])]
+            opacity += w
+        out[ray, 0], out[ray, 1], out[ray, 2] = red, green, blue
+        out[ray, 3], out[ray, 4] = depth, opacity
+
+
+@kernel
+def _add(grid, corner, weight, a, b, c, d):
+    """Add to the eight cells around a located point."""
+    for k in range(2):
+        wz = weight[2] if k else np.float32(1.0) - weight[2]
+        for j in range(2):
+            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
+            for i in range(2):
+                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
+                cell[0] += w * a
+                cell[1] += w * b
+                cell[2] += w * c
+                cell[3] += w * d
+
+
+@kernel
+def _backward(worker, workers, grid, origin, direction, place, opaque_end, wanted, sums):
+    """Gradient of the grid; part after part, each into its own sum."""
+    trace = np.empty((place.shape[1], 7))
+    corner, weight = np.empty(3, np.int64), np.empty(3, np.float32)
+    found = np.empty(4, np.float32)
+    for part in range(worker, len(sums), workers):
+        for ray in range(*share(part, len(sums), len(wanted))):
+            kept = _walk(
+                grid, origin[ray], direction[ray], place[ray], opaque_end, trace, corner, weight,
+                found,
+            )
+            g = wanted[ray]
+            behind = 0.0  # sum over later samples of weight times what it adds to the loss
+            for k in range(kept - 1, -1, -1):
+                row = trace[k]
+                s = int(row[0])
+                z = place[ray, s]
+                value = g[0] * row[4] + g[1] * row[5] + g[2] * row[6] + g[3] * z + g[4]
+                through = 1.0 - row[1]
+                slope = 0.0
+                if row[3] > 0.0:
+                    # d w_k / d tau = T_k e^-tau; every later weight falls in proportion.
+                    front = row[2] / row[1] if row[1] > 0.0 else 0.0
+                    slope = row[3] * (front * through * value - behind)
+                behind += row[2] * value
+                inside = _locate(
+                    grid,
+                    origin[ray, 0] + z * direction[ray, 0],
+                    origin[ray, 1] + z * direction[ray, 1],
+                    origin[ray, 2] + z * direction[ray, 2],
+                    corner,
+                    weight,
+                )
+                if inside:
+                    _add(
+                        sums[part],
+                        corner,
+                        weight,
+                        np.float32(slope),
+                        np.float32(row[2] * g[0] * row[4] * (1.0 - row[4])),
+                        np.float32(row[2] * g[1] * row[5] * (1.0 - row[5])),
+                        np.float32(row[2] * g[2] * row[6] * (1.0 - row[6])),
+                    )

@@ -1,0 +1,63 @@
+"""Light along rays through a voxel grid, in even steps."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.geometry.space import Frustum, Space
+from sharpfield.ops import stepfun
+from sharpfield.ops.voxel_march import march
+
+
+class Grid(Protocol):
+    """Raw density and colour in a box, see `ops.voxel_march`."""
+
+    cells: Tensor
+
+    def place(
+        self, origin: Float[Tensor, "b 3"], direction: Float[Tensor, "b 3"]
+    ) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
+        """Rays in box coordinates."""
+        ...
+
+
+@dataclass(frozen=True)
+class EvenSteps:
+    """Volume rendering of a voxel grid; every sample stands for one step.
+
+    Samples are jittered inside their steps when a generator is given, which training does.
+    """
+
+    field: Grid
+    space: Space
+    samples: int = 96
+
+    def __call__(
+        self, rays: Rays, generator: Generator | None = None, *, samples: bool = False
+    ) -> Radiance:
+        """Radiance of rays of any shape; there are no features to keep."""
+        flat = rays.reshape(-1)
+        origin, direction = self.field.place(*self.space.warp(flat))
+        seen = march(
+            self.field.cells,
+            origin,
+            direction,
+            self._depths(flat, generator),
+            opaque_end=isinstance(self.space, Frustum),
+        )
+        found = Radiance(seen[:, :3], seen[:, 3], seen[:, 4], flat.weight)
+        return found.reshape(*rays.shape)
+
+    def _depths(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "b s"]:
+        if generator is None:
+            place = stepfun.even_positions(rays.shape, 2 * self.samples + 1, rays.device)
+            place = place[:, 1::2]  # middles of the steps
+        else:
+            place = stepfun.stratified_positions(rays.shape, self.samples, generator)
+        near, far = self.space.near, self.space.far
+        return (near + (far - near) * place).contiguous()
