@@ -1,7 +1,7 @@
 """Commands about captures: make one, look into one, deblur one."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,6 @@ from sharpfield.simulation import (
     MOTIONS,
     SCENES,
     SENSORS,
-    EventSensor,
     FrameSensor,
     Rig,
     Timing,
@@ -33,38 +32,57 @@ from sharpfield.simulation import simulate as simulate_scene
 Size = Annotated[str, tyro.conf.arg(metavar="WxH")]
 
 
+@dataclass(frozen=True)
+class Recording:
+    """How the simulated camera moves and what its sensors are like."""
+
+    motion: str = "glide"
+    """A camera path by name: glide, shaky."""
+    sensor: str = "ideal"
+    """An event camera by name: ideal, dvs346."""
+    threshold: float | None = None
+    """Contrast threshold of both signs, instead of the sensor's own."""
+    colour: bool = False
+    """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
+
+    def rig(self, size: tuple[int, int]) -> Rig:
+        """The two sensors."""
+        _known("sensor", self.sensor, SENSORS)
+        events, frames = SENSORS[self.sensor], FrameSensor()
+        if self.threshold is not None:
+            events = replace(events, threshold_on=self.threshold, threshold_off=self.threshold)
+        if self.colour:
+            events, frames = replace(events, bayer="RGGB"), FrameSensor(encoding="linear")
+        return Rig(size, frames, events)
+
+
+RECORDING, TIMING, DEBLURRING = Recording(), Timing(), DeblurOptions()
+
+
 def simulate(
     out: Path,
     scene: str = "garden",
     size: Size = "240x160",
     layout: Literal["native", "ev-deblur-nerf"] = "native",
     seed: int = 0,
-    motion: str = "glide",
-    sensor: str = "ideal",
-    timing: Timing = Timing(),  # noqa: B008 - frozen
-    events: EventSensor | None = None,
+    recording: Recording = RECORDING,
+    timing: Timing = TIMING,
 ) -> None:
     """Record a closed-form scene with a simulated camera: frames, events, poses, sharp truth.
 
     Args:
         out: Folder of the capture.
-        scene: A scene by name.
+        scene: A scene by name: garden, shelf, tiles.
         size: Of the sensor, in pixels.
         layout: Files to write.
         seed: Of the camera path and of all noise.
-        motion: A camera path by name.
-        sensor: An event camera by name.
+        recording: Path and sensors.
         timing: Frames, exposures and sampling.
-        events: All numbers of the event camera, instead of `sensor`.
     """
-    for name, value, known in (
-        ("scene", scene, SCENES),
-        ("motion", motion, MOTIONS),
-        ("sensor", sensor, SENSORS),
-    ):
-        _known(name, value, known)
-    rig = Rig(parse_size(size), FrameSensor(), events or SENSORS[sensor])
-    made = simulate_scene(scene, motion, rig=rig, timing=timing, seed=seed)
+    _known("scene", scene, SCENES)
+    _known("motion", recording.motion, MOTIONS)
+    rig = recording.rig(parse_size(size))
+    made = simulate_scene(scene, recording.motion, rig=rig, timing=timing, seed=seed)
     write(replace(made, name=out.name), out, layout)
     _say_made(made, out)
 
@@ -117,7 +135,7 @@ def deblur(
     capture: Positional[Path],
     out: Path,
     layout: str | None = None,
-    options: DeblurOptions = DeblurOptions(),  # noqa: B008 - frozen
+    options: DeblurOptions = DEBLURRING,
 ) -> None:
     """Sharpen blurry frames with the event double integral; nothing is trained.
 

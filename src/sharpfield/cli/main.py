@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import tyro
 
-from sharpfield.cli.capture_commands import deblur, inspect, simulate
+from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
 from sharpfield.cli.recipe_commands import recipes
 from sharpfield.cli.run_commands import evaluate, render, train
@@ -14,6 +14,7 @@ from sharpfield.core.errors import SharpfieldError
 COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "simulate": simulate,
+    "footage": footage,
     "inspect": inspect,
     "deblur": deblur,
     "train": train,

@@ -27,7 +27,9 @@ def recipes(
             print(f"{known:<18} {_first_line(recipe)}")
         return
     if not name:
-        raise OptionError(f"which recipe? {what} needs a name", do=f"use {', '.join(all_recipes())}")
+        raise OptionError(
+            f"which recipe? {what} needs a name", do=f"use {', '.join(all_recipes())}"
+        )
     recipe = recipe_named(name)
     print(_described(name, recipe) if what == "describe" else _cited(recipe))
 

@@ -1,5 +1,6 @@
 """Commands about runs: train one, measure one, render one."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,8 +16,8 @@ from sharpfield.cli.runs import device_named, measure, open_run, start
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation import Measuring, Refinement, camera_path, refine_poses, write_film
 from sharpfield.metrics.lpips import load_lpips
-from sharpfield.recipes.presets import prepared
 from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.saved import Started
 from sharpfield.rendering.view import render_view
 from sharpfield.training import Options
@@ -25,16 +26,30 @@ Device = Literal["auto", "cpu", "cuda"]
 EIGHT_BIT = 255
 
 
+@dataclass(frozen=True)
+class Choice:
+    """What of the recipe, and of the capture, is used."""
+
+    preset: str = ""
+    """Named settings, several with commas between them; `sharpfield recipes describe RECIPE` lists
+    them. Left out, they follow the capture and the machine."""
+    use: tuple[str, ...] = ("frames", "events")
+    """Streams of the capture to learn from."""
+    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
+    """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
+
+
+CHOICE, OPTIONS = Choice(), Options()
+
+
 def train(
     recipe: Positional[str],
     capture: Positional[Path],
     out: Path,
-    preset: str = "",
     seed: int = 0,
     device: Device = "auto",
-    use: tuple[str, ...] = ("frames", "events"),
-    options: Options = Options(),  # noqa: B008 - frozen
-    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = (),
+    choice: Choice = CHOICE,
+    options: Options = OPTIONS,
 ) -> None:
     """Train a recipe on a capture.
 
@@ -42,19 +57,16 @@ def train(
         recipe: Its name; `sharpfield recipes` lists them.
         capture: Folder of the capture.
         out: Folder of the run.
-        preset: Named settings, several with commas between them; chosen by capture and machine if
-            left out.
         seed: Of everything random.
         device: Where to train.
-        use: Streams of the capture to learn from.
+        choice: Presets, streams, single numbers.
         options: How long, how often to save, how much memory.
-        change: Single numbers of the recipe, such as events.weight=0 frames.instants=7.
     """
     console, where = Console(), device_named(device)
     source = read(capture)
-    made = prepared(recipe, recipe_named(recipe)(), preset, capture=source, device=where)
-    made = changed(made, change)
-    started = Started(recipe, made, str(capture.resolve()), seed, tuple(use))
+    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = changed(made, choice.change)
+    started = Started(recipe, made, str(capture.resolve()), seed, choice.use)
     ledger = start(started, source, out, options, device=where, console=console)
     if ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.", highlight=False)

@@ -156,9 +156,7 @@ class Model(nn.Module):
     def _event_terms(self, events: EventTerm, seen: EventPairs, step: int) -> Terms:
         sensor = events.sensor(step)
         light = self.volume.sharp(sensor.expose(seen), step, "events")
-        errors = [
-            events.error(sensor.observe(stage, seen), seen, step) for stage in stages(light)
-        ]
+        errors = [events.error(sensor.observe(stage, seen), seen, step) for stage in stages(light)]
         terms = {"events": self.recipe.events.weight * torch.stack(errors).sum()}
         if (prior := events.prior()) is not None:
             terms["thresholds"] = self.recipe.events.weight * 1e-2 * prior

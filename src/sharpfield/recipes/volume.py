@@ -128,9 +128,7 @@ class Volume(nn.Module):
             grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}
         networks = [p for p in self.field.parameters() if id(p) not in known]
-        groups = [
-            Group("networks", (*networks, *more), rate), Group("grids", grids, grids_rate)
-        ]
+        groups = [Group("networks", (*networks, *more), rate), Group("grids", grids, grids_rate)]
         return [group for group in groups if group.parameters]
 
 

@@ -48,7 +48,7 @@ class _March(torch.autograd.Function):
         ctx.opaque_end = opaque_end
         out = torch.empty(len(origin), 5)
         rays = (memory(origin), memory(direction), memory(place))
-        spread(_forward, memory(grid), *rays, opaque_end, memory(out))
+        spread(_forward, memory(grid), rays, opaque_end, memory(out))
         return out
 
     @staticmethod
@@ -58,7 +58,7 @@ class _March(torch.autograd.Function):
         sums = np.zeros((PARTS, *grid.shape), np.float32)
         rays = (memory(origin), memory(direction), memory(place))
         wanted = memory(gradients[0].contiguous())
-        spread(_backward, memory(grid), *rays, ctx.opaque_end, wanted, sums)
+        spread(_backward, memory(grid), rays, ctx.opaque_end, wanted, sums)
         sums[0] += sums[1]
         return torch.from_numpy(sums[0]), None, None, None, None
 
@@ -110,11 +110,13 @@ def _sigmoid(raw):
 
 
 @kernel
-def _walk(grid, origin, direction, place, opaque_end, trace, corner, weight, found):
+def _walk(grid, rays, ray, opaque_end, scratch):
     """Fill the trace of one ray; returns how many samples it has.
 
     Columns of the trace: number of the sample, opacity, weight, softplus' slope, three colours.
     """
+    origin, direction, place = rays[0][ray], rays[1][ray], rays[2][ray]
+    trace, corner, weight, found = scratch
     samples = len(place)
     clear = 1.0
     kept = 0
@@ -153,15 +155,20 @@ def _walk(grid, origin, direction, place, opaque_end, trace, corner, weight, fou
 
 
 @kernel
-def _forward(worker, workers, grid, origin, direction, place, opaque_end, out):
+def _scratch(samples):
+    """Room for the trace of a ray, a located point and what was found there."""
+    trace = np.empty((samples, 7))
+    return trace, np.empty(3, np.int64), np.empty(3, np.float32), np.empty(4, np.float32)
+
+
+@kernel
+def _forward(worker, workers, grid, rays, opaque_end, out):
     """Colour, depth and opacity of a share of the rays."""
-    trace = np.empty((place.shape[1], 7))
-    corner, weight = np.empty(3, np.int64), np.empty(3, np.float32)
-    found = np.empty(4, np.float32)
+    place = rays[2]
+    scratch = _scratch(place.shape[1])
+    trace = scratch[0]
     for ray in range(*share(worker, workers, len(out))):
-        kept = _walk(
-            grid, origin[ray], direction[ray], place[ray], opaque_end, trace, corner, weight, found
-        )
+        kept = _walk(grid, rays, ray, opaque_end, scratch)
         red = green = blue = depth = opacity = 0.0
         for k in range(kept):
             w = trace[k, 2]
@@ -191,17 +198,14 @@ def _add(grid, corner, weight, a, b, c, d):
 
 
 @kernel
-def _backward(worker, workers, grid, origin, direction, place, opaque_end, wanted, sums):
+def _backward(worker, workers, grid, rays, opaque_end, wanted, sums):
     """Gradient of the grid; part after part, each into its own sum."""
-    trace = np.empty((place.shape[1], 7))
-    corner, weight = np.empty(3, np.int64), np.empty(3, np.float32)
-    found = np.empty(4, np.float32)
+    origin, direction, place = rays
+    scratch = _scratch(place.shape[1])
+    trace, corner, weight = scratch[0], scratch[1], scratch[2]
     for part in range(worker, len(sums), workers):
         for ray in range(*share(part, len(sums), len(wanted))):
-            kept = _walk(
-                grid, origin[ray], direction[ray], place[ray], opaque_end, trace, corner, weight,
-                found,
-            )
+            kept = _walk(grid, rays, ray, opaque_end, scratch)
             g = wanted[ray]
             behind = 0.0  # sum over later samples of weight times what it adds to the loss
             for k in range(kept - 1, -1, -1):
