@@ -32,12 +32,8 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
             return path.poses
         start, end = (float(capture.clock.unit(t)) for t in known)
         time = torch.linspace(start, end, PATH_SAMPLES)
-        return (
-            capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES).long())
-            .detach()
-            .double()
-            .numpy()
-        )
+        along_it = capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES, dtype=torch.int64))
+        return along_it.detach().double().numpy()
     every = np.arange(len(capture.needed_frames))
     return capture.frame_pose(every).detach().double().numpy()
 
