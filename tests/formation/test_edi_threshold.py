@@ -7,9 +7,11 @@ import torch
 from sharpfield.core import EventStream
 from sharpfield.core.seed import generator
 from sharpfield.formation.edi_threshold import (
+    USUAL,
     best_threshold,
     best_thresholds,
     disagreement,
+    distance_from_usual,
     edge_density,
 )
 from sharpfield.formation.log_path import LogPath, change_between, direct, follow
@@ -94,7 +96,18 @@ def test_edges_are_denser_in_blur_and_in_noise() -> None:
     noisy = sharp + 0.2 * torch.randn(sharp.shape, generator=generator(0, 0, "noise"))
     assert edge_density(sharp) < edge_density(blurred)
     assert edge_density(sharp) < edge_density(noisy)
+    left = torch.zeros(40, 40, 1, dtype=torch.bool)
+    left[:, :20] = True
+    half = torch.cat([sharp[:, :21], noisy[:, 21:]], 1)
+    assert edge_density(half, left) == pytest.approx(edge_density(sharp, left))
     assert edge_density(3 * sharp + 1) == pytest.approx(edge_density(sharp))
+
+
+def test_usual_thresholds_are_not_pulled() -> None:
+    assert distance_from_usual(FixedThresholds(USUAL, USUAL)) == 0
+    further = distance_from_usual(FixedThresholds(2 * USUAL, 2 * USUAL))
+    assert further == pytest.approx(distance_from_usual(FixedThresholds(USUAL / 2, USUAL / 2)))
+    assert further > 0.01
 
 
 @pytest.mark.parametrize("lowest", [0.03, 0.2, 0.9])

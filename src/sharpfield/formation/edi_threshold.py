@@ -6,11 +6,12 @@ Two judges say how well a threshold explains a recording; lower is better.
 neighbour plus the events between the two. Only the right threshold makes them agree, for any
 scene that moves, without any idea of what a sharp picture looks like.
 
-*Density of edges*: the mean length of the gradient over its root mean square. Blur and noise both
-fill a picture with small gradients, sharp edges are few and tall; so the number balances total
-variation against edge strength, which is how the EDI paper chooses. It serves where a single
-frame is all there is. It tends to values some tenths too large, because exaggerated edges are
-taller still.
+*Density of edges*: the mean length of the gradient over its root mean square, where events were.
+Blur and noise both fill a picture with small gradients, sharp edges are few and tall; so the number
+balances total variation against edge strength, which is how the EDI paper chooses. It serves
+where a single frame is all there is. Alone it is easily fooled (exaggerated edges are taller
+still, and a frame with little blur says next to nothing), hence a mild pull towards the threshold
+most sensors are set to.
 
 Sources: Pan et al. (CVPR 2019), section 3.3; Krishnan et al., "Blind deconvolution using a
 normalized sparsity measure" (CVPR 2011).
@@ -29,6 +30,9 @@ from sharpfield.formation.threshold import FixedThresholds
 
 LOWEST, HIGHEST = 0.02, 1.2
 """Thresholds searched, in natural log. Sensors are set to 0.1 ... 0.5."""
+
+USUAL, PULL = 0.2, 0.03
+"""Threshold towards which a single frame's choice is pulled, and how strongly."""
 
 COARSE = 10
 """Thresholds tried before the best one's neighbourhood is searched."""
@@ -72,16 +76,27 @@ def disagreement(
     return total / count if count else math.inf
 
 
-def edge_density(picture: Float[Tensor, "h w 1"]) -> float:
+def edge_density(
+    picture: Float[Tensor, "h w 1"], where: Bool[Tensor, "h w 1"] | None = None
+) -> float:
     """Mean over root mean square of the gradient's length: 1 if everywhere alike, 0 if sparse.
 
     Args:
         picture: Display-referred, so that edges count as they are seen.
+        where: The pixels to look at; all by default.
     """
     grey = picture[..., 0]
     right, down = grey[:-1, 1:] - grey[:-1, :-1], grey[1:, :-1] - grey[:-1, :-1]
     length = (right.square() + down.square()).sqrt()
+    if where is not None:
+        length = length[where[:-1, :-1, 0]]
     return float(length.mean() / length.square().mean().sqrt().clamp_min(1e-12))
+
+
+def distance_from_usual(thresholds: FixedThresholds) -> float:
+    """The pull towards the usual threshold, to be added to the density of edges."""
+    log = math.log(thresholds.negative / USUAL), math.log(thresholds.positive / USUAL)
+    return PULL * (log[0] ** 2 + log[1] ** 2) / 2
 
 
 def best_threshold(cost: Cost) -> FixedThresholds:

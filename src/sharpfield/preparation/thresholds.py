@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
-from torch import Tensor
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.formation.edi import latent
@@ -14,6 +14,7 @@ from sharpfield.formation.edi_threshold import (
     best_threshold,
     best_thresholds,
     disagreement,
+    distance_from_usual,
     edge_density,
 )
 from sharpfield.formation.threshold import FixedThresholds
@@ -138,4 +139,11 @@ class _SingleJudge:
     def cost(self, thresholds: FixedThresholds) -> float:
         path = self.motion.path(self.window_us, np.array([sum(self.window_us) // 2]), thresholds)
         sharp = self.tone.encode(latent(self.light, path, 0).clamp(0, 1))
-        return edge_density(luma(sharp)[..., None])
+        where = _grown(path.log_mean != 0)
+        return edge_density(luma(sharp)[..., None], where) + distance_from_usual(thresholds)
+
+
+def _grown(moved: Bool[Tensor, "h w c"]) -> Bool[Tensor, "h w 1"]:
+    """Pixels within two of one that moved, in any colour."""
+    any_colour = moved.any(-1).float()[None, None]
+    return nn.functional.max_pool2d(any_colour, 5, 1, 2)[0, 0, ..., None] > 0
