@@ -1,7 +1,7 @@
 """Light along rays through a voxel grid, in even steps."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,7 @@ from sharpfield.ops import stepfun
 from sharpfield.ops.voxel_march import march
 
 
+@runtime_checkable
 class Grid(Protocol):
     """Raw density and colour in a box, see `ops.voxel_march`."""
 
