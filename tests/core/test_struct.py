@@ -76,6 +76,11 @@ def test_reshaping_there_and_back():
     assert same(flat.reshape(4, 3), made)
 
 
+def test_a_single_ray():
+    made = rays(1)
+    assert made.reshape().shape == () and same(made.reshape().reshape(1), made)
+
+
 def test_joining_undoes_splitting():
     made = radiance(7)
     assert same(Radiance.cat([made[:2], made[2:2], made[2:]]), made)

@@ -51,7 +51,9 @@ class Struct:
     def reshape(self: S, *shape: int) -> S:
         """Give the leading axes another shape."""
         return self.map(
-            lambda tensor, trailing: tensor.reshape(*shape, *tensor.shape[tensor.ndim - trailing :])
+            lambda tensor, trailing: tensor.reshape(
+                (*shape, *tensor.shape[tensor.ndim - trailing :])
+            )
         )
 
     @property

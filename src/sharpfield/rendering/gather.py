@@ -83,7 +83,7 @@ def gather(head: Head, work: Work, how: Compositing, *, keep_feature: bool = Fal
         keep_feature: Also return the head's hidden features.
     """
     step = max(CHUNK[work.z.device.type] // work.z.shape[1], 1)
-    pieces = [work[first : first + step] for first in range(0, len(work), step)]
+    pieces = [work[first : first + step] for first in range(0, max(len(work), 1), step)]
     if not torch.is_grad_enabled():
         return Found.cat([_seen(head, piece, how, keep_feature=keep_feature) for piece in pieces])
 
