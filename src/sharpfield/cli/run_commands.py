@@ -164,4 +164,7 @@ def changed(recipe: Any, changes: tuple[str, ...]) -> Any:
                 "cannot read a change of the recipe", got=change, do="write NAME=VALUE"
             )
         words += [f"--{name}", *value.split(",")]
-    return tyro.cli(type(recipe), default=recipe, args=words) if words else recipe
+    if not words:
+        return recipe
+    # Without flags, so that a boolean takes its value like every other number: NAME=False.
+    return tyro.cli(type(recipe), default=recipe, args=words, config=(tyro.conf.FlagConversionOff,))
