@@ -171,9 +171,12 @@ class Model(nn.Module):
         return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
-        """Networks, grids, kernel and response, all at one rate."""
-        kernel = tuple(self.frames.parameters()) if self.frames is not None else ()
-        groups = self.volume.groups(self.rate, scaled(self.rate, self.recipe.grids_faster), *kernel)
+        """Networks, grids, kernel and response, all at one rate unless a recipe says otherwise."""
+        recipe = self.recipe
+        groups = self.volume.groups(self.rate, scaled(self.rate, recipe.grids_faster))
+        if self.frames is not None and (kernel := tuple(self.frames.parameters())):
+            slower = 1.0 if recipe.kernel.rate is None else recipe.kernel.rate / recipe.rate
+            groups.append(Group("kernel", kernel, scaled(self.rate, slower)))
         return groups + (self.events.groups(self.rate) if self.events is not None else [])
 
     def _frame_term(self) -> KernelTerm | MotionTerm:

@@ -25,6 +25,8 @@ class KernelOptions:
 
     motions: int = 9
     """Learned rigid motions per image; the unmoved ray comes on top."""
+    rate: float | None = None
+    """First learning rate of kernel and adaptive network; None for that of everything."""
     adaptive: bool = True
     """A network proposes other weights for each pixel, from the features along its rays."""
     integration: str = "channels"

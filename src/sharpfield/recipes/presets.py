@@ -63,15 +63,10 @@ def physical(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
     )
 
 
-DRAFT: dict[str, Any] = {
-    "voxels": (80**3, 160**3),
-    "channels": (16, 8, 8),
-    "coarse": (32, 15, 32),
-    "fine": (64, 32, 64),
-    "octaves": (2, 2),
-    "samples": (32, 32),
-    "precision": "auto",
-}
+GRID_RATE = 0.2
+"""Learning rate of a dense grid, whose cells are density and colour themselves."""
+
+DRAFT: dict[str, Any] = {"kind": "voxels", "voxels": (0, 0), "samples": (96, 0), "noise": 0.0}
 
 STANDARD: dict[str, Any] = {
     "voxels": (160**3, 320**3),
@@ -85,16 +80,26 @@ STANDARD: dict[str, Any] = {
 
 
 def draft(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
-    """Minutes on two processor cores."""
-    recipe = replace(recipe.lasting(1500), rate=1e-2, volume=replace(recipe.volume, **DRAFT))
+    """Minutes on two processor cores: a dense grid instead of planes and networks."""
+    recipe = recipe.lasting(2000)
     frames = recipe.frames
     frames = replace(
         frames,
-        pixels=min(frames.pixels, 512),
-        blurred_pixels=min(frames.blurred_pixels, 64),
+        pixels=min(frames.pixels, 768),
+        blurred_pixels=min(frames.blurred_pixels, 192),
         instants=min(frames.instants, 5),
+        blur_from=min(frames.blur_from, 800),
     )
-    return replace(recipe, frames=frames, events=replace(recipe.events, pairs=256))
+    return replace(
+        recipe,
+        rate=GRID_RATE,
+        decay=1000,
+        smooth=0.0,
+        volume=replace(recipe.volume, **DRAFT),
+        frames=frames,
+        kernel=replace(recipe.kernel, rate=recipe.rate),
+        events=replace(recipe.events, pairs=512, weight=2 * recipe.events.weight),
+    )
 
 
 def standard(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
@@ -119,9 +124,8 @@ def paper(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
 
 
 def nerf_draft(recipe: NeRF) -> NeRF:
-    """Planes instead of large networks; minutes on two processor cores."""
-    volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **DRAFT)
-    return NeRF(steps=1500, rate=1e-2, decay=500, smooth=0.02, pixels=512, volume=volume)
+    """A dense grid instead of large networks; minutes on two processor cores."""
+    return NeRF(steps=2000, rate=GRID_RATE, decay=1000, pixels=1024, volume=VolumeOptions(**DRAFT))
 
 
 def nerf_standard(recipe: NeRF) -> NeRF:

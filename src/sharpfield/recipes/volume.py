@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
@@ -21,6 +22,9 @@ from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
 from sharpfield.rendering.march import EvenSteps
 
+MOST_CELLS = 4_000_000
+"""Cells of a dense grid that sizes itself; each costs 64 bytes with its gradient and moments."""
+
 
 @dataclass(frozen=True)
 class VolumeOptions:
@@ -31,7 +35,7 @@ class VolumeOptions:
     density and colour without any network."""
     voxels: tuple[int, int] = (16_777_248, 134_217_984)
     """Resolution of the coarse and the fine volume: about 256^3 and 512^3. A dense grid has the
-    second."""
+    second; 0 gives it about a cell for each pixel and step."""
     channels: tuple[int, int, int] = (64, 16, 16)
     """Features of the xy, xz and yz planes."""
     coarse: tuple[int, int, int] = (64, 15, 64)
@@ -83,7 +87,7 @@ class Volume(nn.Module):
         poses = reference_poses(self.capture)
         self.space = _space(options, self.capture, poses)
         box = self.space.box(torch.from_numpy(poses).float())
-        self.field = _field(options, box, seed)
+        self.field = _field(options, box, self.capture.camera, seed)
         if isinstance(self.field, VoxelGrid):
             self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
             self.view = self.train_view
@@ -120,15 +124,15 @@ class Volume(nn.Module):
         planes, lines = self.field.planes(), self.field.lines()
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
-    def groups(self, rate: Schedule, grids_rate: Schedule, *more: nn.Parameter) -> list[Group]:
-        """Parameters of grids and of networks, the latter with others that learn like them."""
+    def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
+        """Parameters of the networks and of the grids."""
         if isinstance(self.field, VoxelGrid):
             grids: tuple[nn.Parameter, ...] = (self.field.cells,)
         else:
             grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}
         networks = [p for p in self.field.parameters() if id(p) not in known]
-        groups = [Group("networks", (*networks, *more), rate), Group("grids", grids, grids_rate)]
+        groups = [Group("networks", tuple(networks), rate), Group("grids", grids, grids_rate)]
         return [group for group in groups if group.parameters]
 
 
@@ -138,10 +142,11 @@ def stages(light: Radiance) -> list[Radiance]:
 
 
 def _field(
-    options: VolumeOptions, box: Float[Tensor, "2 3"], seed: int
+    options: VolumeOptions, box: Float[Tensor, "2 3"], camera: Camera, seed: int
 ) -> PlaneField | MLPField | VoxelGrid:
     if options.kind == "voxels":
-        return VoxelGrid(box, options.voxels[1])
+        pixels = camera.width * camera.height
+        return VoxelGrid(box, options.voxels[1] or min(pixels * sum(options.samples), MOST_CELLS))
     made = generator(seed, 0, "field")
     if options.kind == "mlp":
         return MLPField(generator=made)
