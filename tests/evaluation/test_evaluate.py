@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.evaluation.fake import CAMERA, Sky, capture
 
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError, RunError
@@ -14,6 +13,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.metrics import Lpips
 from sharpfield.metrics.lpips import BACKBONES
+from tests.evaluation.fake import CAMERA, Sky, capture
 
 
 def random_lpips() -> Lpips:
@@ -135,6 +135,15 @@ def test_events_alone_are_aligned_in_log_intensity(tmp_path: Path, bayer: str):
     else:
         assert metrics["mean"]["psnr"] > 20 and len(alignment["gain"]) == 1
         assert metrics["protocol"]["compared_as"] == "luma"
+
+
+def test_a_model_whose_recipe_left_the_frames_out_can_be_called_blind(tmp_path: Path):
+    dim = Sky(capture(), gain=0.5)
+    plain = evaluate(dim, capture(), tmp_path)
+    blind = evaluate(dim, capture(), tmp_path, measuring=Measuring(events_only=True))
+    assert plain["protocol"]["alignment"] is None
+    assert blind["protocol"]["alignment"] is not None
+    assert blind["mean"]["psnr"] > plain["mean"]["psnr"]
 
 
 def test_a_model_that_saw_frames_is_not_aligned(tmp_path: Path):

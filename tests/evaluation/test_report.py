@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -7,7 +8,9 @@ import numpy as np
 import pytest
 
 from sharpfield.core import Paper
+from sharpfield.core.capture import Split
 from sharpfield.evaluation import Measuring, Story, evaluate, page, report, write_report
+from sharpfield.evaluation.compared import input_name
 from sharpfield.evaluation.page import Look, embedded
 from sharpfield.evaluation.report import flat
 from tests.evaluation.fake import Sky, capture
@@ -105,6 +108,13 @@ def test_what_a_capture_lacks_is_left_out(tmp_path: Path, lacking, text: str):
     told = checked(write_report(tmp_path, lacking, metrics, Story("odd")))
     assert text in told.text or text == "without"
     assert "brighter" in told.text or lacking.events is None
+
+
+def test_frames_are_called_blurry_only_if_they_may_be():
+    sharp = replace(capture(), split=Split(np.array([0, 4]), np.array([1])))
+    assert input_name(capture()) == "blurry input"
+    assert input_name(sharp) == "input"
+    assert input_name(replace(sharp, notes={"motion": "unknown"})) == "blurry input"
 
 
 def test_events_alone_are_said_to_be_aligned(tmp_path: Path):

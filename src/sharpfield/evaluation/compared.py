@@ -17,7 +17,14 @@ from sharpfield.metrics import luma
 VIEWS = 4
 """Most views of a kind to show; the tables have them all."""
 
-INPUT, RESULT, STORED, ERROR, DEPTH = "blurry input", "result", "stored image", "error", "depth"
+RESULT, STORED, ERROR, DEPTH = "result", "stored image", "error", "depth"
+
+
+def input_name(capture: Capture) -> str:
+    """What to call recorded frames: blurry if they were, or may have been, exposed for a while."""
+    frames = capture.frames
+    lasting = frames is not None and not frames.exposure.instant[capture.split.train].all()
+    return "blurry input" if lasting or capture.notes.get("motion") == "unknown" else "input"
 
 
 def compared_views(
@@ -39,20 +46,24 @@ def compared_views(
     }
     chosen = [rows[i] for i in spread(np.arange(len(rows)), VIEWS)]
     return [
-        _view(run, row, known[row["frame"]], others)
+        _view(run, row, known[row["frame"]], others, input_name(capture))
         for row in chosen
         if row["frame"] in known and (run / row["image"]).is_file()
     ]
 
 
 def _view(
-    run: Path, row: Mapping[str, Any], reference: Reference, others: Mapping[str, Path]
+    run: Path,
+    row: Mapping[str, Any],
+    reference: Reference,
+    others: Mapping[str, Path],
+    recorded: str,
 ) -> View:
     result = read_image(run / row["image"])
     pictures = []
     if reference.kind in (TRUTH, ""):
         measured = eight_bit(reference.measured.numpy())
-        pictures.append(_picture(INPUT, measured, reference.name, row.get("input")))
+        pictures.append(_picture(recorded, measured, reference.name, row.get("input")))
     pictures.append(_picture(RESULT, result, reference.name, row))
     for name, folder in others.items():
         if (folder / row["image"]).is_file():

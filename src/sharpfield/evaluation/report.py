@@ -15,7 +15,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.paper import Paper
 from sharpfield.evaluation import page
 from sharpfield.evaluation.captured import captured
-from sharpfield.evaluation.compared import INPUT, RESULT, STORED, compared_views
+from sharpfield.evaluation.compared import RESULT, STORED, compared_views, input_name
 from sharpfield.evaluation.figures import curves_figure
 from sharpfield.evaluation.page import Look, View, section
 from sharpfield.evaluation.pictures import ERROR_WHITE
@@ -68,7 +68,7 @@ def _body(run: Path, capture: Capture, metrics: Mapping[str, Any], story: Story,
     test = compared_views(run, capture, metrics, metrics["views"])
     parts = [
         _header(metrics, story),
-        _result(train, test, metrics, look),
+        _result(train, test, metrics, look, recorded=input_name(capture)),
         captured(capture, look),
         _numbers(metrics),
         _training(run, metrics),
@@ -122,7 +122,12 @@ def _lpips_note(lpips: Mapping[str, Any]) -> str:
 
 
 def _result(
-    train: Sequence[View], test: Sequence[View], metrics: Mapping[str, Any], look: Look
+    train: Sequence[View],
+    test: Sequence[View],
+    metrics: Mapping[str, Any],
+    look: Look,
+    *,
+    recorded: str,
 ) -> str:
     legend = (
         f'<p class="scale">error (mean absolute, display values) 0 <i></i> {ERROR_WHITE:g} and more'
@@ -130,9 +135,9 @@ def _result(
     )
     parts = []
     if train:
-        parts.append("<h3>What the camera recorded, and the sharp scene at mid-exposure</h3>")
+        parts.append("<h3>What the camera recorded, and the scene at mid-exposure</h3>")
         worst = _blurriest(train, metrics)
-        parts.append(page.comparison(train, look, left=INPUT, right=RESULT, first=worst))
+        parts.append(page.comparison(train, look, left=recorded, right=RESULT, first=worst))
     if test:
         right = TRUTH if TRUTH in [p.kind for p in test[0].pictures] else STORED
         parts.append("<h3>Held-out views, which training never saw</h3>")
