@@ -29,7 +29,7 @@ from sharpfield.formation.edi_threshold import best_threshold, disagreement
 from sharpfield.formation.log_path import LogPath
 from sharpfield.formation.threshold import FixedThresholds
 
-JUDGED = 6
+JUDGED = 12
 """Pairs of neighbouring frames that choose the threshold."""
 
 DARK, BRIGHT = 0.03, 0.97
