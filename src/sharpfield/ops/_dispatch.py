@@ -17,7 +17,7 @@ import functools
 import importlib
 import importlib.util
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
@@ -111,7 +111,7 @@ class Op(Generic[P, R]):
 
 
 @contextlib.contextmanager
-def using(choice: str) -> Iterator[None]:
+def using(choice: str) -> Generator[None]:
     """Choose `auto`, `reference` or `fast` for the ops called inside."""
     token = _choice.set(choice)
     try:

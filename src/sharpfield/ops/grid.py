@@ -32,7 +32,7 @@ def grid_shape(box: Float[Tensor, "2 3"], voxels: int) -> tuple[int, int, int]:
         box: Low and high corner.
         voxels: Budget of the whole box.
     """
-    extent = (box[1].double() - box[0].double()).tolist()
+    extent = [float(side) for side in box[1].double() - box[0].double()]
     edge = (math.prod(extent) / voxels) ** (1 / 3)
     x, y, z = (max(int(length / edge), 2) for length in extent)
     return x, y, z

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sharpfield.ops.fast._kernel import kernel, share
-from sharpfield.ops.fast._lanes import load, prefetch, store, total
+from sharpfield.ops.fast._lanes import load, prefetch, store, total, zeros
+from sharpfield.ops.grid import PAIRS
 
 BANDS = 8
 """Shares of a plane's rows; a constant, so that results do not depend on the number of threads."""
 
-STRIPE = 4
+STRIPE = 8
 """Neighbouring rows of one band: samples crowd around surfaces, and stripes spread the crowd."""
 
 AHEAD = 8
@@ -38,11 +39,16 @@ class Taps(NamedTuple):
 class Volume(NamedTuple):
     """Three planes and three lines."""
 
-    axes: np.ndarray
-    """`[3, 3]`: of each pair."""
-    planes: tuple[np.ndarray, np.ndarray, np.ndarray]
-    lines: tuple[np.ndarray, np.ndarray, np.ndarray]
+    planes: tuple[np.ndarray, ...]
+    lines: tuple[np.ndarray, ...]
     lanes: tuple[int, ...]
+
+
+class Gradients(NamedTuple):
+    """Of a volume; of its lines one per band, `[BANDS, l, c]`, still to be summed."""
+
+    planes: tuple[np.ndarray, ...]
+    lines: tuple[np.ndarray, ...]
 
 
 @kernel
@@ -66,11 +72,11 @@ def locate(worker, workers, points, shape, taps):
 
 
 @kernel
-def _corners(cells, axes, plane):
+def _corners(cells, point, axes, plane):
     """Where the four taps of a plane begin."""
     columns, channels = plane.shape[1], plane.shape[2]
-    left, right = cells[axes[0], 0], cells[axes[0], 1]
-    top, bottom = cells[axes[1], 0] * columns, cells[axes[1], 1] * columns
+    left, right = cells[point, axes[0], 0], cells[point, axes[0], 1]
+    top, bottom = cells[point, axes[1], 0] * columns, cells[point, axes[1], 1] * columns
     return (
         (top + left) * channels,
         (top + right) * channels,
@@ -80,9 +86,15 @@ def _corners(cells, axes, plane):
 
 
 @kernel
-def _ends(cells, axes, line):
+def _ends(cells, point, axes, line):
     """Where the two taps of a line begin."""
-    return cells[axes[2], 0] * line.shape[1], cells[axes[2], 1] * line.shape[1]
+    channels = line.shape[1]
+    return cells[point, axes[2], 0] * channels, cells[point, axes[2], 1] * channels
+
+
+@kernel
+def _both(weights, point, axis):
+    return weights[point, axis, 0], weights[point, axis, 1]
 
 
 @kernel
@@ -92,11 +104,14 @@ def _products(columns, rows):
 
 
 @kernel
-def _fetch(cells, axes, plane, lanes):
+def _fetch(cells, point, axes, plane, lanes):
     """Ask for the rows of a plane that a point needs."""
-    for corner in _corners(cells, axes, plane):
-        for channel in range(0, plane.shape[2], len(lanes)):
-            prefetch(plane, corner + channel)
+    corners = _corners(cells, point, axes, plane)
+    for channel in range(0, plane.shape[2], len(lanes)):
+        prefetch(plane, corners[0] + channel)
+        prefetch(plane, corners[1] + channel)
+        prefetch(plane, corners[2] + channel)
+        prefetch(plane, corners[3] + channel)
 
 
 @kernel
@@ -118,30 +133,29 @@ def _on_line(line, ends, weights, channel, lanes):
 
 
 @kernel
-def _gather_pair(taps, point, axes, tables, out, at, lanes):
-    """Write plane times line at one point, from position `at` on."""
+def _gather_pair(points, taps, axes, tables, out, first, lanes):
+    """Write plane times line, at points from `points[0]` to `points[1]`."""
+    cells, weights = taps.cells, taps.weights
     plane, line = tables
-    cells, weights = taps.cells[point], taps.weights[point]
-    corners, ends = _corners(cells, axes, plane), _ends(cells, axes, line)
-    shares, along = _products(weights[axes[0]], weights[axes[1]]), weights[axes[2]]
-    for channel in range(0, plane.shape[2], len(lanes)):
-        row = _on_plane(plane, corners, shares, channel, lanes)
-        store(out, at + channel, row * _on_line(line, ends, along, channel, lanes))
+    for point in range(points[0], points[1]):
+        _fetch(cells, min(point + AHEAD, points[1] - 1), axes, plane, lanes)
+        corners, ends = _corners(cells, point, axes, plane), _ends(cells, point, axes, line)
+        columns, rows = _both(weights, point, axes[0]), _both(weights, point, axes[1])
+        shares, along = _products(columns, rows), _both(weights, point, axes[2])
+        at = point * out.shape[1] + first
+        for channel in range(0, plane.shape[2], len(lanes)):
+            row = _on_plane(plane, corners, shares, channel, lanes)
+            store(out, at + channel, row * _on_line(line, ends, along, channel, lanes))
 
 
 @kernel
 def gather(worker, workers, taps, volume, out):
     """Write the features of a worker's points into `out [n, f]`."""
-    points, features = out.shape
-    for point in range(*share(worker, workers, points)):
-        ahead = taps.cells[min(point + AHEAD, points - 1)]
-        at = point * features
-        for pair in range(3):
-            _fetch(ahead, volume.axes[pair], volume.planes[pair], volume.lanes)
-        for pair in range(3):
-            tables = (volume.planes[pair], volume.lines[pair])
-            _gather_pair(taps, point, volume.axes[pair], tables, out, at, volume.lanes)
-            at += tables[0].shape[2]
+    points, first = share(worker, workers, out.shape[0]), 0
+    for pair in range(3):
+        tables = (volume.planes[pair], volume.lines[pair])
+        _gather_pair(points, taps, PAIRS[pair], tables, out, first, volume.lanes)
+        first += tables[0].shape[2]
 
 
 @kernel
@@ -165,89 +179,81 @@ def _add(target, at, row, lanes):
 
 
 @kernel
-def _scatter_point(band, taps, point, axes, pair, grad, at, lanes):
-    """Add one point to the rows of a band; to the line too, if its first row is of the band."""
-    plane, line, plane_grad, line_grad = pair
-    cells, weights = taps.cells[point], taps.weights[point]
-    corners, ends = _corners(cells, axes, plane), _ends(cells, axes, line)
-    shares, along = _products(weights[axes[0]], weights[axes[1]]), weights[axes[2]]
-    has_top, has_bottom = _is_in(cells[axes[1], 0], band), _is_in(cells[axes[1], 1], band)
-    for channel in range(0, plane.shape[2], len(lanes)):
-        arrived = load(grad, at + channel, lanes)
-        to_plane = arrived * _on_line(line, ends, along, channel, lanes)
-        if has_top:
-            to_line = arrived * _on_plane(plane, corners, shares, channel, lanes)
-            _add(line_grad, ends[0] + channel, to_line * along[0], lanes)
-            _add(line_grad, ends[1] + channel, to_line * along[1], lanes)
-            _add(plane_grad, corners[0] + channel, to_plane * shares[0], lanes)
-            _add(plane_grad, corners[1] + channel, to_plane * shares[1], lanes)
-        if has_bottom:
-            _add(plane_grad, corners[2] + channel, to_plane * shares[2], lanes)
-            _add(plane_grad, corners[3] + channel, to_plane * shares[3], lanes)
-
-
-@kernel
-def _scatter_band(band, taps, axes, pair, grad, first, lanes):
-    """Add all points to the rows of a band."""
-    points = np.empty(taps.cells.shape[0] + 1, np.intp)
-    count = _points_of_band(taps.cells, axes[1], band, points)
+def _scatter_pair(band, taps, axes, tables, gradients, grad, first, lanes):
+    """Add to the rows of a band; to the line too, where a point's first row is of the band."""
+    cells, weights = taps.cells, taps.weights
+    plane, line = tables
+    plane_grad, line_grad = gradients
+    points = np.empty(cells.shape[0] + 1, np.intp)
+    count = _points_of_band(cells, axes[1], band, points)
     for index in range(count):
-        ahead = taps.cells[points[min(index + AHEAD, count - 1)]]
-        _fetch(ahead, axes, pair[0], lanes)
-        _fetch(ahead, axes, pair[2], lanes)
-        at = points[index] * grad.shape[1] + first
-        _scatter_point(band, taps, points[index], axes, pair, grad, at, lanes)
+        point, ahead = points[index], points[min(index + AHEAD, count - 1)]
+        _fetch(cells, ahead, axes, plane, lanes)
+        _fetch(cells, ahead, axes, plane_grad, lanes)
+        corners, ends = _corners(cells, point, axes, plane), _ends(cells, point, axes, line)
+        columns, rows = _both(weights, point, axes[0]), _both(weights, point, axes[1])
+        shares, along = _products(columns, rows), _both(weights, point, axes[2])
+        has_top = _is_in(cells[point, axes[1], 0], band)
+        has_bottom = _is_in(cells[point, axes[1], 1], band)
+        at = point * grad.shape[1] + first
+        for channel in range(0, plane.shape[2], len(lanes)):
+            arrived = load(grad, at + channel, lanes)
+            to_plane = arrived * _on_line(line, ends, along, channel, lanes)
+            if has_top:
+                to_line = arrived * _on_plane(plane, corners, shares, channel, lanes)
+                _add(line_grad, ends[0] + channel, to_line * along[0], lanes)
+                _add(line_grad, ends[1] + channel, to_line * along[1], lanes)
+                _add(plane_grad, corners[0] + channel, to_plane * shares[0], lanes)
+                _add(plane_grad, corners[1] + channel, to_plane * shares[1], lanes)
+            if has_bottom:
+                _add(plane_grad, corners[2] + channel, to_plane * shares[2], lanes)
+                _add(plane_grad, corners[3] + channel, to_plane * shares[3], lanes)
 
 
 @kernel
 def scatter(worker, workers, taps, volume, gradients, grad):
-    """Add the gradients of planes and lines, as far as they are in a worker's bands.
-
-    Args:
-        worker: Which one.
-        workers: How many.
-        taps: Of all points.
-        volume: The planes and lines.
-        gradients: Of the planes `[h, w, c]`, and of the lines per band `[BANDS, l, c]`.
-        grad: The gradient of the features `[n, f]`.
-    """
+    """Add what `grad [n, f]` says about planes and lines, as far as it is in a worker's bands."""
     for band in range(worker, BANDS, workers):
         first = 0
         for pair in range(3):
-            plane, line = volume.planes[pair], volume.lines[pair]
-            tables = (plane, line, gradients[0][pair], gradients[1][pair][band])
-            _scatter_band(band, taps, volume.axes[pair], tables, grad, first, volume.lanes)
-            first += plane.shape[2]
+            tables = (volume.planes[pair], volume.lines[pair])
+            targets = (gradients.planes[pair], gradients.lines[pair][band])
+            _scatter_pair(band, taps, PAIRS[pair], tables, targets, grad, first, volume.lanes)
+            first += tables[0].shape[2]
 
 
 @kernel
-def _slope_of_pair(taps, point, axes, tables, grad, at, lanes, out):
-    """Add the gradient of one pair to that of a point."""
+def _slope_of_pair(points, taps, axes, tables, grad, first, lanes, out):
+    """Add the gradient of one pair to that of points from `points[0]` to `points[1]`."""
+    cells, weights, slopes = taps.cells, taps.weights, taps.slopes
     plane, line = tables
-    cells, weights, slopes = taps.cells[point], taps.weights[point], taps.slopes[point]
-    columns, rows, along = weights[axes[0]], weights[axes[1]], weights[axes[2]]
-    corners, ends = _corners(cells, axes, plane), _ends(cells, axes, line)
-    shares = _products(columns, rows)
-    by_column, by_row = _products(slopes[axes[0]], rows), _products(columns, slopes[axes[1]])
-    for channel in range(0, plane.shape[2], len(lanes)):
-        arrived = load(grad, at + channel, lanes)
-        to_plane = arrived * _on_line(line, ends, along, channel, lanes)
-        to_line = arrived * _on_plane(plane, corners, shares, channel, lanes)
-        out[axes[0]] += total(to_plane * _on_plane(plane, corners, by_column, channel, lanes))
-        out[axes[1]] += total(to_plane * _on_plane(plane, corners, by_row, channel, lanes))
-        out[axes[2]] += total(to_line * _on_line(line, ends, slopes[axes[2]], channel, lanes))
+    for point in range(points[0], points[1]):
+        _fetch(cells, min(point + AHEAD, points[1] - 1), axes, plane, lanes)
+        corners, ends = _corners(cells, point, axes, plane), _ends(cells, point, axes, line)
+        columns, rows = _both(weights, point, axes[0]), _both(weights, point, axes[1])
+        shares, along = _products(columns, rows), _both(weights, point, axes[2])
+        by_column = _products(_both(slopes, point, axes[0]), rows)
+        by_row = _products(columns, _both(slopes, point, axes[1]))
+        by_along = _both(slopes, point, axes[2])
+        of_column, of_row, of_along = zeros(plane, lanes), zeros(plane, lanes), zeros(plane, lanes)
+        at = point * grad.shape[1] + first
+        for channel in range(0, plane.shape[2], len(lanes)):
+            arrived = load(grad, at + channel, lanes)
+            to_plane = arrived * _on_line(line, ends, along, channel, lanes)
+            to_line = arrived * _on_plane(plane, corners, shares, channel, lanes)
+            of_column += to_plane * _on_plane(plane, corners, by_column, channel, lanes)
+            of_row += to_plane * _on_plane(plane, corners, by_row, channel, lanes)
+            of_along += to_line * _on_line(line, ends, by_along, channel, lanes)
+        out[point, axes[0]] += total(of_column)
+        out[point, axes[1]] += total(of_row)
+        out[point, axes[2]] += total(of_along)
 
 
 @kernel
 def slope(worker, workers, taps, volume, grad, out):
     """Add the gradients of a worker's points to `out [n, 3]`."""
-    points, features = grad.shape
-    for point in range(*share(worker, workers, points)):
-        ahead = taps.cells[min(point + AHEAD, points - 1)]
-        at = point * features
-        for pair in range(3):
-            _fetch(ahead, volume.axes[pair], volume.planes[pair], volume.lanes)
-        for pair in range(3):
-            axes, tables = volume.axes[pair], (volume.planes[pair], volume.lines[pair])
-            _slope_of_pair(taps, point, axes, tables, grad, at, volume.lanes, out[point])
-            at += tables[0].shape[2]
+    points, first = share(worker, workers, out.shape[0]), 0
+    for pair in range(3):
+        tables = (volume.planes[pair], volume.lines[pair])
+        _slope_of_pair(points, taps, PAIRS[pair], tables, grad, first, volume.lanes, out)
+        first += tables[0].shape[2]

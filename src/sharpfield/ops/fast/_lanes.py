@@ -14,8 +14,11 @@ type, so the compiler knows it. Positions count numbers from the start of a cont
 shape.
 """
 
+import inspect
 import math
 import operator
+from collections.abc import Callable
+from typing import Any
 
 from llvmlite import ir
 from numba import types
@@ -48,6 +51,14 @@ def lanes_for(*channels: int) -> tuple[int, ...]:
     return (0,) * math.gcd(WIDEST, *channels)
 
 
+def instruction(define: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function that kernels call of one that says how to generate its code.
+
+    `define` gets numba's typing context and the types of the arguments.
+    """
+    return intrinsic(inspect.unwrap(define))
+
+
 def _address(context, builder, array_type, array, position, target):
     data = context.make_array(array_type)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [position]), target.as_pointer())
@@ -58,7 +69,7 @@ def _indices(which):
     return ir.Constant(ir.VectorType(INT32, len(which)), list(which))
 
 
-@intrinsic
+@instruction
 def load(typing, array, position, lanes):
     """The numbers of `array` from `position` on."""
     row = Lanes(array.dtype, lanes.count)
@@ -71,7 +82,7 @@ def load(typing, array, position, lanes):
     return row(array, types.intp, lanes), generate
 
 
-@intrinsic
+@instruction
 def store(typing, array, position, row):
     """Write the numbers of `row` into `array` from `position` on."""
 
@@ -84,7 +95,7 @@ def store(typing, array, position, row):
     return types.void(array, types.intp, row), generate
 
 
-@intrinsic
+@instruction
 def zeros(typing, array, lanes):
     """Zeros of the type of the numbers of `array`."""
     row = Lanes(array.dtype, lanes.count)
@@ -95,7 +106,7 @@ def zeros(typing, array, lanes):
     return row(array, lanes), generate
 
 
-@intrinsic
+@instruction
 def prefetch(typing, array, position):
     """Ask for the cache line of a number that will soon be needed."""
 
@@ -110,7 +121,7 @@ def prefetch(typing, array, position):
     return types.void(array, types.intp), generate
 
 
-@intrinsic
+@instruction
 def total(typing, row):
     """The sum of the numbers in `row`: the upper half is added to the lower until one is left."""
 
@@ -126,7 +137,7 @@ def total(typing, row):
     return row.element(row), generate
 
 
-@intrinsic
+@instruction
 def _add(typing, one, other):
     def generate(context, builder, signature, arguments):
         return builder.fadd(*arguments, flags=CONTRACT)
@@ -134,7 +145,7 @@ def _add(typing, one, other):
     return one(one, other), generate
 
 
-@intrinsic
+@instruction
 def _subtract(typing, one, other):
     def generate(context, builder, signature, arguments):
         return builder.fsub(*arguments, flags=CONTRACT)
@@ -142,7 +153,7 @@ def _subtract(typing, one, other):
     return one(one, other), generate
 
 
-@intrinsic
+@instruction
 def _multiply(typing, one, other):
     def generate(context, builder, signature, arguments):
         return builder.fmul(*arguments, flags=CONTRACT)
@@ -150,7 +161,7 @@ def _multiply(typing, one, other):
     return one(one, other), generate
 
 
-@intrinsic
+@instruction
 def _scale(typing, row, factor):
     def generate(context, builder, signature, arguments):
         vector, factor = arguments

@@ -1,3 +1,4 @@
+# pyright: basic
 """Plane and line lookups on the CPU.
 
 Points are worked through in chunks whose taps and features stay in the processor's cache, so that
@@ -14,9 +15,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast import _grid_kernels as kernels
-from sharpfield.ops.fast._kernel import memory, spread
+from sharpfield.ops.fast._kernel import empty, memory, spread
 from sharpfield.ops.fast._lanes import lanes_for
-from sharpfield.ops.grid import PAIRS, plane_line_features, plane_line_mixture
+from sharpfield.ops.grid import plane_line_features, plane_line_mixture
 
 CHUNK = 8192
 """Points at a time: 3 MB of 96 features."""
@@ -57,7 +58,7 @@ class _Lookup(torch.autograd.Function):
         ctx.save_for_backward(points, basis, *grids)
         volume = _volume(grids)
         features = sum(plane.shape[2] for plane in volume.planes)
-        out = points.new_empty(len(points), features if basis is None else basis.shape[1])
+        out = empty(points, len(points), features if basis is None else basis.shape[1])
         tile = points.new_empty(CHUNK, features)
         for rows, taps in _chunks(points, volume):
             if basis is None:
@@ -74,7 +75,7 @@ class _Lookup(torch.autograd.Function):
         points, basis, *grids = ctx.saved_tensors
         needs_points, needs_basis, *needs_grids = ctx.needs_input_grad
         grad, volume = gradients[0].contiguous(), _volume(grids)
-        of_grids = _GridGradients(volume) if any(needs_grids) else None
+        of_grids = _zero_gradients(volume) if any(needs_grids) else None
         of_points = torch.zeros_like(points) if needs_points else None
         of_basis = torch.zeros_like(basis) if needs_basis else None
         tile = points.new_empty(CHUNK, grad.shape[1] if basis is None else len(basis))
@@ -86,18 +87,31 @@ class _Lookup(torch.autograd.Function):
             if basis is not None:
                 arrived = torch.mm(arrived, basis.T, out=part)
             if of_grids is not None:
-                spread(kernels.scatter, taps, volume, of_grids.arrays, memory(arrived))
+                spread(kernels.scatter, taps, volume, of_grids, memory(arrived))
             if of_points is not None:
                 spread(kernels.slope, taps, volume, memory(arrived), memory(of_points[rows]))
-        tables = of_grids.tensors() if of_grids else [None] * len(grids)
-        return of_points, of_basis, *tables
+        return of_points, of_basis, *(_tensors(of_grids) if of_grids else [None] * len(grids))
 
 
 def _volume(grids: Sequence[Tensor]) -> kernels.Volume:
     """Three planes and three lines as kernels see them."""
     views = [memory(grid) for grid in grids]
     lanes = lanes_for(*(view.shape[-1] for view in views))
-    return kernels.Volume(np.array(PAIRS), tuple(views[:3]), tuple(views[3:]), lanes)
+    return kernels.Volume(tuple(views[:3]), tuple(views[3:]), lanes)
+
+
+def _zero_gradients(volume: kernels.Volume) -> kernels.Gradients:
+    bands = kernels.BANDS
+    return kernels.Gradients(
+        tuple(np.zeros_like(plane) for plane in volume.planes),
+        tuple(np.zeros((bands, *line.shape), line.dtype) for line in volume.lines),
+    )
+
+
+def _tensors(gradients: kernels.Gradients) -> list[Tensor]:
+    """The gradients of planes, then of lines."""
+    lines = [bands.sum(0) for bands in gradients.lines]
+    return [torch.from_numpy(table) for table in (*gradients.planes, *lines)]
 
 
 def _chunks(points: Tensor, volume: kernels.Volume) -> Iterator[tuple[slice, kernels.Taps]]:
@@ -111,21 +125,3 @@ def _chunks(points: Tensor, volume: kernels.Volume) -> Iterator[tuple[slice, ker
         taps = kernels.Taps(np.empty(size, np.intp), weights, slopes)
         spread(kernels.locate, some, shape, taps)
         yield rows, taps
-
-
-class _GridGradients:
-    """Gradients of planes and lines, filled chunk by chunk.
-
-    Numpy allocates them because it asks for huge pages, which are several times faster to fill.
-    """
-
-    def __init__(self, volume: kernels.Volume) -> None:
-        planes = tuple(np.zeros_like(plane) for plane in volume.planes)
-        bands = kernels.BANDS
-        lines = tuple(np.zeros((bands, *line.shape), line.dtype) for line in volume.lines)
-        self.arrays = planes, lines
-
-    def tensors(self) -> list[Tensor]:
-        """The gradients, planes first."""
-        planes, lines = self.arrays
-        return [torch.from_numpy(grad) for grad in (*planes, *(bands.sum(0) for bands in lines))]

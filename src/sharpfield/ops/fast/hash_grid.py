@@ -61,7 +61,6 @@ class _HashFeatures(torch.autograd.Function):
             arrays = memory(points), memory(table), ctx.levels, memory(grad), memory(of_points)
             spread(_slope, *arrays)
         if ctx.needs_input_grad[1]:
-            # Numpy asks for huge pages, which are several times faster to fill.
             of_table = np.zeros_like(memory(table))
             spread(_scatter, memory(points), ctx.levels, memory(grad), of_table)
             of_table = torch.from_numpy(of_table)

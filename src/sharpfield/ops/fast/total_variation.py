@@ -13,13 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.fast._kernel import empty, kernel, memory, share, spread
 from sharpfield.ops.fast._lanes import lanes_for, load, store, total, zeros
 from sharpfield.ops.total_variation import total_variation
 
 
 @total_variation.accelerate("cpu", needs="numba")
 def _(grid: Float[Tensor, "*size c"]) -> Float[Tensor, ""]:
+    if grid.ndim > 3:
+        return total_variation.reference(grid)
     plane = grid.contiguous()
     return _TotalVariation.apply(plane if plane.ndim == 3 else plane[None])
 
@@ -38,11 +40,10 @@ class _TotalVariation(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
         (plane,) = ctx.saved_tensors
         values = memory(plane)
-        # Numpy asks for huge pages, which are several times faster to fill.
-        out = np.empty_like(values)
+        out = empty(plane, *plane.shape)
         scales = (2 * gradients[0].item() * _scales(plane)).astype(values.dtype)
-        spread(_differentiate, values, lanes_for(plane.shape[-1]), scales, out)
-        return torch.from_numpy(out)
+        spread(_differentiate, values, lanes_for(plane.shape[-1]), scales, memory(out))
+        return out
 
 
 def _scales(plane: Tensor) -> np.ndarray:
