@@ -28,20 +28,14 @@ SMALL = VolumeOptions(
 def small(recipe: Any, *, kind: str = "planes") -> Any:
     """The recipe at a size for tests; what is modelled stays."""
     kept = {"noise": recipe.volume.noise, "density": recipe.volume.density}
+    waits = 10 if getattr(getattr(recipe, "frames", None), "frames_from", 1) > 1 else 1
     recipe = replace(recipe.lasting(12), volume=replace(SMALL, kind=kind, **kept), rate=1e-2)
     if isinstance(recipe, NeRF):
         return replace(recipe, pixels=64)
-    frames = replace(
-        recipe.frames,
-        pixels=48,
-        blurred_pixels=16,
-        instants=3,
-        blur_from=9,
-        frames_from=min(recipe.frames.frames_from, 10),
-    )
+    few = {"pixels": 48, "blurred_pixels": 16, "instants": 3}
     return replace(
         recipe,
-        frames=frames,
+        frames=replace(recipe.frames, blur_from=9, frames_from=waits, **few),
         kernel=replace(recipe.kernel, motions=2),
         events=replace(recipe.events, pairs=48),
         smooth=1e-3,

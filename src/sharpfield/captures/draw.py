@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float32, Int8, Int64, Shaped
 from torch import Tensor
 
-from sharpfield.captures.site_colour import site_channels
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import EventPairs, Pixels
@@ -30,6 +29,7 @@ from sharpfield.ops.event_index import (
     previous_event,
 )
 from sharpfield.ops.permutation import shuffled
+from sharpfield.ops.site_colour import site_channels
 
 Device = torch.device | str
 

@@ -1,4 +1,4 @@
-"""The command line: one verb per command, errors in words, exit code 2 when the user can mend it."""
+"""The command line: a command for each verb, errors in words, exit code 2 for what you can mend."""
 
 import sys
 from collections.abc import Callable, Sequence

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from rich.console import Console
 from rich.progress import Progress
-from torch import nn
 
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
+from sharpfield.core.protocols import Model
 from sharpfield.evaluation import Measuring, Story, evaluate, write_report
 from sharpfield.recipes.saved import Started, read_started, write_started
 from sharpfield.training import (
@@ -81,7 +81,7 @@ def start(
     """Train a recipe on a capture in a run folder, or go on with it."""
     chosen = used(capture, started.use)
 
-    def build(steps: int) -> nn.Module:
+    def build(steps: int) -> Model:
         return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
 
     if not options.resume:

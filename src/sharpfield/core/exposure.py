@@ -47,3 +47,7 @@ class Exposure:
     def instant(self) -> Bool[np.ndarray, "n"]:
         """Whether a frame was taken at one instant, free of motion blur by construction."""
         return self.open_us == self.close_us
+
+    def window(self, frame: int) -> tuple[int, int]:
+        """Opening and closing time of one frame, in us."""
+        return int(self.open_us[frame]), int(self.close_us[frame])

@@ -75,8 +75,15 @@ class Field(Protocol):
     in the backward pass, chunk by chunk, and keep only what was looked up.
     """
 
-    coarse: Head
-    fine: Head
+    @property
+    def coarse(self) -> Head:
+        """Of the first stage."""
+        ...
+
+    @property
+    def fine(self) -> Head:
+        """Of the second stage."""
+        ...
 
     def look(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]

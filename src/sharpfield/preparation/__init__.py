@@ -1,8 +1,8 @@
 """Before training: make the most of a recording."""
 
+from sharpfield.formation.event_motion import EventMotion
 from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur
 from sharpfield.preparation.deblur_report import deblur_to
-from sharpfield.preparation.event_motion import EventMotion
 from sharpfield.preparation.thresholds import Found, find_thresholds
 
 __all__ = [

@@ -15,13 +15,12 @@ from torch import Tensor
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.formation.edi import FLOOR, joint_latents, latent, published
+from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
 from sharpfield.metrics.sharpness import luma
-from sharpfield.preparation.event_motion import EventMotion
 from sharpfield.preparation.thresholds import (
     Found,
-    exposure_of,
     find_thresholds,
     known_thresholds,
     linear_light,
@@ -114,7 +113,7 @@ def _exact(
 ) -> Shaped[np.ndarray, "k h w c"]:
     tone = tone_of(capture.needed_frames.encoding)
     light = linear_light(capture, frame, tone)
-    path = motion.path(exposure_of(capture, frame), instants_us, thresholds)
+    path = motion.path(capture.needed_frames.exposure.window(frame), instants_us, thresholds)
     sharp = torch.stack([latent(light, path, k) for k in range(len(instants_us))])
     return _stored(capture, tone.encode(sharp.clamp(0, 1)))
 
@@ -124,7 +123,7 @@ def _published(
 ) -> Shaped[np.ndarray, "1 h w c"]:
     held = capture.needed_frames
     stored = torch.from_numpy(np.asarray(held.images[frame], np.float32)) / held.white
-    window = exposure_of(capture, frame)
+    window = capture.needed_frames.exposure.window(frame)
     return _stored(capture, published(stored, capture.needed_events, window, thresholds)[None])
 
 
@@ -139,7 +138,9 @@ def _joint(
     tone = tone_of(capture.needed_frames.encoding)
     sharp = []
     for frame, middle in zip(frames, middles_us, strict=True):
-        path = motion.path(exposure_of(capture, int(frame)), np.array([middle]), thresholds)
+        path = motion.path(
+            capture.needed_frames.exposure.window(int(frame)), np.array([middle]), thresholds
+        )
         sharp.append(latent(linear_light(capture, int(frame), tone), path, 0))
     sharp = torch.stack(sharp)
     told = sharp if motion.channel is not None else luma(sharp)[..., None]

@@ -17,10 +17,10 @@ from sharpfield.formation.edi_threshold import (
     distance_from_usual,
     edge_density,
 )
+from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import Tone, tone_of
 from sharpfield.metrics.sharpness import luma
-from sharpfield.preparation.event_motion import EventMotion
 
 PAIRS = 4
 """Pairs of neighbouring frames looked at, spread over the capture."""
@@ -81,12 +81,6 @@ def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w
     return tone.decode(stored)
 
 
-def exposure_of(capture: Capture, frame: int) -> tuple[int, int]:
-    """When the shutter of a frame opened and closed."""
-    exposure = capture.needed_frames.exposure
-    return int(exposure.open_us[frame]), int(exposure.close_us[frame])
-
-
 def _neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
     """Consecutive frames of one track, in order of time."""
     held = capture.needed_frames
@@ -111,7 +105,12 @@ class _PairJudge:
         if motion.channel is None:
             light = luma(light)[..., None]
         middles = [int(capture.needed_frames.exposure.middle_us[frame]) for frame in pair]
-        return cls(motion, light, [exposure_of(capture, int(frame)) for frame in pair], middles)
+        return cls(
+            motion,
+            light,
+            [capture.needed_frames.exposure.window(int(frame)) for frame in pair],
+            middles,
+        )
 
     def cost(self, thresholds: FixedThresholds) -> float:
         paths = [
@@ -133,7 +132,7 @@ class _SingleJudge:
     @classmethod
     def of(cls, capture: Capture, motion: EventMotion, frame: int) -> "_SingleJudge":
         tone = tone_of(capture.needed_frames.encoding)
-        window = exposure_of(capture, frame)
+        window = capture.needed_frames.exposure.window(frame)
         return cls(motion, linear_light(capture, frame, tone), window, tone)
 
     def cost(self, thresholds: FixedThresholds) -> float:

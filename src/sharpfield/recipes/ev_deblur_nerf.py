@@ -189,15 +189,12 @@ class Model(nn.Module):
             targets = None
             if sharpened and self.events is not None:
                 targets = InstantsPrior(
-                    self.capture,
-                    self.events.table.index,
-                    self.events.guess,
-                    instants=recipe.frames.instants,
+                    self.capture, self.events.guess, instants=recipe.frames.instants
                 )
             return MotionTerm(recipe.frames, volume, self.tone.encode, weight, prior=targets)
         middle = None
         if sharpened and self.events is not None:
-            middle = MiddlePrior(prior, self.capture, self.events.table.index, self.events.guess)
+            middle = MiddlePrior(prior, self.capture, self.events.guess)
         blur = None
         if recipe.frames.blur != "none":
             blur = LearnedBlur(

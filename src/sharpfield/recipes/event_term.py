@@ -136,7 +136,7 @@ class EventTerm(nn.Module):
 
 
 def thresholds_of(capture: Capture, given: tuple[float, float] | None) -> tuple[float, float]:
-    """Contrast thresholds to darker and to brighter: those given, those noted, or the usual ones."""
+    """Contrast thresholds to darker and to brighter: given, noted by the capture, or the usual."""
     if given is not None:
         return given
     negative, positive = (float(capture.notes.get(name, USUAL)) for name in NOTED)

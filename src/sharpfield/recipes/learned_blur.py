@@ -12,7 +12,7 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
-from sharpfield.formation.adaptive import AdaptiveWeights
+from sharpfield.formation.adaptive import AdaptiveWeights, Integration, Norm
 from sharpfield.formation.mix import Curve
 from sharpfield.formation.rigid_kernel import RigidKernel, RigidMotions
 from sharpfield.losses.photometric import mse
@@ -29,9 +29,9 @@ class KernelOptions:
     """First learning rate of kernel and adaptive network; None for that of everything."""
     adaptive: bool = True
     """A network proposes other weights for each pixel, from the features along its rays."""
-    integration: str = "channels"
+    integration: Integration = "channels"
     """`channels` is the released rule of the adaptive network, `samples` the intended one."""
-    norm: str = "batch"
+    norm: Norm = "batch"
     """Normalisation inside the adaptive network: batch (released) or layer."""
     trust: tuple[float, float] = (0.1, 0.9)
     """Share of the adaptive weights in the loss, when the kernel begins and at the end."""

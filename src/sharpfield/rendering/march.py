@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
@@ -18,7 +17,10 @@ from sharpfield.ops.voxel_march import march
 class Grid(Protocol):
     """Raw density and colour in a box, see `ops.voxel_march`."""
 
-    cells: Tensor
+    @property
+    def cells(self) -> Tensor:
+        """The grid itself."""
+        ...
 
     def place(
         self, origin: Float[Tensor, "b 3"], direction: Float[Tensor, "b 3"]

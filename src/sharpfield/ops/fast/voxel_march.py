@@ -23,6 +23,9 @@ PARTS = 2
 DARK = 1e-5
 """A ray ends when less than this share of light gets through."""
 
+FAINT = 1e-7
+"""The colour of a sample with a smaller share of the ray's light is not computed."""
+
 
 @march.accelerate("cpu", needs="numba")
 def _(
@@ -144,9 +147,10 @@ def _walk(grid, rays, ray, opaque_end, scratch):
         row[1] = alpha
         row[2] = clear * alpha
         row[3] = 0.0 if last else _sigmoid(raw)
-        row[4] = _sigmoid(found[1])
-        row[5] = _sigmoid(found[2])
-        row[6] = _sigmoid(found[3])
+        if row[2] > FAINT:
+            row[4], row[5], row[6] = _sigmoid(found[1]), _sigmoid(found[2]), _sigmoid(found[3])
+        else:
+            row[4] = row[5] = row[6] = 0.0
         kept += 1
         clear *= 1.0 - alpha
         if clear < DARK:

@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float, Int8, Int64
 from torch import Tensor
 
-from sharpfield.captures.site_colour import site_channels
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
@@ -14,6 +13,7 @@ from sharpfield.formation.log_path import LogPath, Spread, change_between, cover
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.ops.event_index import build
 from sharpfield.ops.event_sites import find_sites, parts
+from sharpfield.ops.site_colour import site_channels
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,139 @@
+"""The commands as a user types them: what they write, what they print, how they refuse."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sharpfield.cli.main import main
+
+SMALL = ("--change", "volume.voxels=0,4000", "volume.samples=16,0", "events.pairs=32")
+
+
+def run(*words: object) -> int:
+    """The exit code of a command."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny capture, made by the command."""
+    out = tmp_path_factory.mktemp("recorded") / "tiny"
+    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
+    assert run("simulate", "--out", out, *words, "--interval-us", 24_000, "--test-every", 4) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def trained(recorded: Path) -> Path:
+    """A run of four steps on it."""
+    out = recorded.parent / "run"
+    words = ("--out", out, "--preset", "draft", "--steps", 4, *SMALL)
+    assert run("train", "ev-deblur-nerf", recorded, *words) == 0
+    return out
+
+
+def test_inspect_keeps_its_contract(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("inspect", recorded, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["kind"] == "capture"
+    assert {"count", "on", "t_first_us", "t_last_us", "width", "height"} <= found["events"].keys()
+    assert found["frames"]["count"] == 5
+    assert (found["frames"]["blurry"], found["frames"]["sharp"]) == (3, 2)
+    assert (found["frames"]["width"], found["frames"]["height"]) == (16, 12)
+    assert run("inspect", recorded / "events.h5", "--json") == 0
+    alone = json.loads(capsys.readouterr().out)
+    assert alone["kind"] == "events"
+    assert alone["events"]["count"] == found["events"]["count"]
+
+
+def test_simulate_writes_the_published_layout(tmp_path: Path, recorded: Path) -> None:
+    out = tmp_path / "published"
+    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
+    assert run("simulate", "--out", out, "--layout", "ev-deblur-nerf", *words) == 0
+    assert (out / "images_1" / "timestamps.npz").is_file()
+    assert (out / "all_poses_bounds.npy").is_file()
+
+
+def test_deblur_writes_pictures(recorded: Path, tmp_path: Path) -> None:
+    assert run("deblur", recorded, "--out", tmp_path / "sharp") == 0
+    assert len(list((tmp_path / "sharp").glob("*.png"))) == 3 + 1  # and the contact sheet
+
+
+def test_evaluate_keeps_its_contract(trained: Path) -> None:
+    assert run("evaluate", trained) == 0
+    metrics = json.loads((trained / "metrics.json").read_text())
+    assert metrics.keys() >= {"protocol", "mean", "views", "train"}
+    assert metrics["mean"].keys() >= {"psnr", "ssim", "ssim_paper", "lpips"}
+    assert [view["name"] for view in metrics["views"]] == ["0000", "0004"]
+    assert metrics["train"]["steps"] == 4
+    assert metrics["train"].keys() >= {"seconds", "peak_memory_mb"}
+    assert "<html" in (trained / "report.html").read_text()
+
+
+def test_render_makes_a_film_and_pictures(trained: Path, tmp_path: Path) -> None:
+    assert run("render", trained, "--out", tmp_path / "film.mp4", "--pictures", 3) == 0
+    assert (tmp_path / "film.mp4").stat().st_size > 0
+    words = ("--path", "exposure:1", "--pictures", 2)
+    assert run("render", trained, "--out", tmp_path / "inside", *words) == 0
+    assert len(list((tmp_path / "inside").glob("*.png"))) == 2
+
+
+def test_resuming_equals_never_having_stopped(recorded: Path, trained: Path) -> None:
+    again = recorded.parent / "again"
+    words = ("train", "ev-deblur-nerf", recorded, "--out", again, "--preset", "draft", *SMALL)
+    assert run(*words, "--steps", 4, "--checkpoint-every", 1) == 0
+    last = again / "checkpoints" / "last.safetensors"
+    straight = last.read_bytes()
+    (again / "checkpoints" / "previous.safetensors").replace(last)  # as if killed at step 3
+    assert run(*words, "--resume", "--checkpoint-every", 1) == 0
+    assert last.read_bytes() == straight
+
+
+def test_recipes_speak(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("recipes") == 0
+    assert "ev-deblur-nerf" in capsys.readouterr().out
+    assert run("recipes", "describe", "ev-deblur-nerf") == 0
+    assert "events.pairs" in capsys.readouterr().out
+    assert run("recipes", "cite", "ev-deblur-nerf") == 0
+    cited = capsys.readouterr().out
+    assert "Cannici" in cited
+    assert "- Samples are sorted after the networks" in cited
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("inspect", "nowhere"), "capture not found"),
+        (("evaluate", "nowhere"), "this is not a run"),
+        (("render", "nowhere", "--out", "x.mp4"), "this is not a run"),
+        (("simulate", "--out", "x", "--size", "big"), "cannot read the size"),
+        (("simulate", "--out", "x", "--scene", "moon"), "unknown scene"),
+        (("recipes", "describe", "nerff"), "unknown recipe"),
+    ],
+)
+def test_what_the_user_can_mend_ends_with_code_2(
+    words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*words) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert "Traceback" not in said
+
+
+def test_nanoseconds_taken_for_microseconds_are_noticed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "published"
+    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
+    assert run("simulate", "--out", out, "--layout", "ev-deblur-nerf", *words) == 0
+    stamps = out / "all_timestamps.npy"
+    np.save(stamps, np.load(stamps) * 1000)
+    capsys.readouterr()
+    assert run("inspect", out) == 2
+    assert "ns" in capsys.readouterr().err
