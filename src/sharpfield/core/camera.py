@@ -160,12 +160,17 @@ def _fisheye_plane(
     points: Float[Tensor, "*b 3"], coefficients: tuple[float, ...]
 ) -> Float[Tensor, "*b 2"]:
     """Where points fall on the plane z = 1 of a lens whose radius grows with the angle."""
-    sideways, forward = points[..., :2].norm(dim=-1), points[..., 2]
+    sideways, forward = _length(points[..., :2]), points[..., 2]
     bent = _fisheye_angle(torch.atan2(sideways, forward), coefficients)
     # Both branches stay finite, also in their gradients, where the other one is taken.
     on_axis = 1 / forward.clamp_min(AXIS)
     scale = torch.where(sideways > AXIS, bent / sideways.clamp_min(AXIS), on_axis)
     return points[..., :2] * scale[..., None]
+
+
+def _length(plane: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+    """Distance from the centre; unlike that of `torch.hypot`, its gradient there is zero."""
+    return torch.linalg.vector_norm(plane, dim=-1)  # pyright: ignore
 
 
 def _fisheye_angle(
@@ -182,7 +187,7 @@ def _fisheye_direction(
 ) -> Float[Tensor, "*b 3"]:
     """Unit directions that fall on positions of the plane, by Newton's method on the angle."""
     k1, k2, k3, k4 = coefficients
-    bent = plane.norm(dim=-1)
+    bent = _length(plane)
     theta = bent
     for _ in range(UNDISTORT_STEPS):
         t2 = theta * theta

@@ -17,6 +17,9 @@ from sharpfield.core.protocols import Trajectory
 HELD_BACK_US = 2
 """Rounding of times in published files; poses may end this much before an exposure does."""
 
+Note = Shaped[np.ndarray, "..."] | float | str
+"""A fact about a capture that only some sources know."""
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -65,7 +68,7 @@ class Capture:
     name: str = "capture"
     source: str = ""
     """The layout it was read from."""
-    notes: dict[str, Shaped[np.ndarray, "..."] | float | str] = field(default_factory=dict)
+    notes: dict[str, Note] = field(default_factory=dict[str, Note])
     """What the source says besides: thresholds of a simulation, rounding of times, ..."""
 
     def __post_init__(self) -> None:
@@ -87,7 +90,7 @@ class Capture:
         """Opening and closing time of each frame as the unit times that rays carry."""
         frames = self.needed_frames
         times = [frames.exposure.open_us, frames.exposure.close_us]
-        return torch.from_numpy(np.stack([self.clock.unit(t) for t in times], -1)).float()
+        return torch.as_tensor(np.stack([self.clock.unit(t) for t in times], -1)).float()
 
     @property
     def needed_frames(self) -> Frames:
@@ -114,8 +117,8 @@ class Capture:
     def frame_pose(self, frames: Int64[np.ndarray, "m"]) -> Float[Tensor, "m 3 4"]:
         """World-from-camera poses in the middle of the exposures of some frames."""
         held = self.needed_frames
-        time = torch.from_numpy(self.clock.unit(held.exposure.middle_us[frames])).float()
-        return self.trajectory.pose(time, torch.from_numpy(held.track[frames]))
+        time = torch.as_tensor(self.clock.unit(held.exposure.middle_us[frames])).float()
+        return self.trajectory.pose(time, torch.as_tensor(held.track[frames]))
 
     def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
         """The same capture with frames or events taken away."""

@@ -31,7 +31,7 @@ class Struct:
                 changed[name] = change(value, self.trailing.get(name, 0))
             elif isinstance(value, Struct):
                 changed[name] = value.map(change)
-        return dataclasses.replace(self, **changed)  # pyright: ignore[reportArgumentType]
+        return dataclasses.replace(self, **changed)  # pyright: ignore
 
     def to(self: S, device: torch.device | str) -> S:
         """The same struct on another device."""
@@ -39,12 +39,12 @@ class Struct:
 
     def __getitem__(self: S, index: Any) -> S:
         """Index the leading axes; every field keeps its trailing axes whole."""
-        index = index if isinstance(index, tuple) else (index,)
-        reaches_last = any(part is Ellipsis for part in index)
+        parts: list[Any] = [*index] if isinstance(index, tuple) else [index]
+        reaches_last = any(part is Ellipsis for part in parts)
 
         def pick(tensor: Tensor, trailing: int) -> Tensor:
             whole = [slice(None)] * trailing if reaches_last else []
-            return tensor[(*index, *whole)]
+            return tensor[(*parts, *whole)]
 
         return self.map(pick)
 
@@ -86,7 +86,7 @@ class Struct:
                 joined[field.name] = torch.cat(values)
             elif isinstance(values[0], Struct):
                 joined[field.name] = type(values[0]).cat(values)
-        return dataclasses.replace(items[0], **joined)  # pyright: ignore[reportArgumentType]
+        return dataclasses.replace(items[0], **joined)  # pyright: ignore
 
     def _fields(self) -> list[tuple[str, Any]]:
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]

@@ -5,7 +5,9 @@ ECCV 2022). The coarse head sees one volume, the fine head that one and a finer 
 2023); both also get the frequency-encoded position. Positions are those of the renderer's space.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -36,7 +38,7 @@ FINE = HeadSize(hidden=256, feature=128, colour=256)
 
 
 class Volume(nn.Module):
-    """Features in a box: sum over planes times lines, mixed by one matrix.
+    """Features in a box: planes times lines, mixed by one matrix.
 
     Args:
         box: Low and high corner.
@@ -46,6 +48,8 @@ class Volume(nn.Module):
         channels: Features of the three planes and their lines.
         spread: Standard deviation of the first values.
     """
+
+    box: Float[Tensor, "2 3"]
 
     def __init__(
         self,
@@ -141,6 +145,8 @@ class PlaneField(nn.Module):
         precision: What the heads compute in.
     """
 
+    volumes: Sequence[Volume]
+
     def __init__(
         self,
         box: Float[Tensor, "2 3"],
@@ -154,9 +160,10 @@ class PlaneField(nn.Module):
         precision: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        self.volumes = nn.ModuleList(
+        volumes = [
             Volume(box, count, features, generator=generator, channels=channels) for count in voxels
-        )
+        ]
+        self.volumes = cast(Sequence[Volume], nn.ModuleList(volumes))
         self.coarse, self.fine = (
             PlaneHead(width, size, generator=generator, octaves=octaves, precision=precision)
             for width, size in zip((features, 2 * features), heads, strict=True)

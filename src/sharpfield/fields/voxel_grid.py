@@ -21,6 +21,8 @@ class VoxelGrid(nn.Module):
         voxels: Budget of cells.
     """
 
+    box: Float[Tensor, "2 3"]
+
     def __init__(self, box: Float[Tensor, "2 3"], voxels: int) -> None:
         super().__init__()
         self.register_buffer("box", box.float(), persistent=False)

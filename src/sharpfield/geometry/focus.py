@@ -17,6 +17,7 @@ def focus(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"] | None:
     system = across.mean(0)
     if np.linalg.eigvalsh(system)[0] < PARALLEL:
         return None
-    point = np.linalg.solve(system, (across @ centre[..., None]).mean(0)[:, 0])
+    right = (across @ centre[..., None]).mean(0)[:, 0]
+    point = np.asarray(np.linalg.solve(system, right), np.float64)  # pyright: ignore
     before = ((point - centre) * forward).sum(-1) > 0
     return point if before.mean() > 0.5 else None

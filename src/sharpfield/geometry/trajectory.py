@@ -5,6 +5,7 @@ clamped to what is known. A *track* is one camera's path; see `core.protocols.Tr
 """
 
 from collections.abc import Sequence
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import CaptureError
+from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry import se3, spline
 from sharpfield.geometry.space import Similarity
 
@@ -49,6 +51,13 @@ class Stamped(nn.Module):
     data are interpolated with an interpolating cubic for translation.
     """
 
+    stamps: Float[Tensor, "p"]
+    rotation: Float[Tensor, "p 3 3"]
+    turn: Float[Tensor, "q 3"]
+    """Rotation vector from each pose to the next; q = p - 1."""
+    curve: Float[Tensor, "q 4 3"]
+    """Coefficients of the translation in each segment, see `spline.cubic_coefficients`."""
+
     def __init__(
         self,
         times_us: Int64[np.ndarray, "p"],
@@ -78,13 +87,13 @@ class Stamped(nn.Module):
     def _prepare(self) -> None:
         unit = self.clock.unit(self.times_us)
         segments = _line if self.translation == "linear" else spline.cubic_coefficients
-        rotation = torch.from_numpy(self.poses[:, :, :3])
+        rotation = torch.as_tensor(self.poses[:, :, :3])
         turn = se3.rotation_log(rotation[:-1].transpose(-1, -2) @ rotation[1:])
-        self.register_buffer("stamps", torch.from_numpy(unit), persistent=False)
+        self.register_buffer("stamps", torch.as_tensor(unit), persistent=False)
         self.register_buffer("rotation", rotation.contiguous(), persistent=False)
         self.register_buffer("turn", turn, persistent=False)
         self.register_buffer(
-            "curve", torch.from_numpy(segments(unit, self.poses[:, :, 3])), persistent=False
+            "curve", torch.as_tensor(segments(unit, self.poses[:, :, 3])), persistent=False
         )
 
     def pose(
@@ -121,11 +130,13 @@ def _line(times: Float[np.ndarray, "p"], values: Float[np.ndarray, "p d"]) -> np
 class Still(nn.Module):
     """Tracks that stand still: one pose each, at any time."""
 
+    fixed: Float[Tensor, "n 3 4"]
+
     def __init__(self, poses: Float[np.ndarray, "n 3 4"]) -> None:
         super().__init__()
         check_poses(poses)
         self.poses = np.asarray(poses, np.float64)
-        self.register_buffer("fixed", torch.from_numpy(self.poses).float(), persistent=False)
+        self.register_buffer("fixed", torch.as_tensor(self.poses).float(), persistent=False)
 
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
@@ -141,9 +152,11 @@ class Still(nn.Module):
 class Tracks(nn.Module):
     """Several tracks: first those that move, then those that stand still."""
 
+    moving: Sequence[Trajectory]
+
     def __init__(self, moving: Sequence[nn.Module], still: Float[np.ndarray, "n 3 4"]) -> None:
         super().__init__()
-        self.moving = nn.ModuleList(moving)
+        self.moving = cast(Sequence[Trajectory], nn.ModuleList(moving))
         self.still = Still(still)
 
     def pose(
@@ -171,6 +184,8 @@ class BSpline(nn.Module):
 
     Segment i lies between knots i+1 and i+2, so `m` knots span `m - 3` segments.
     """
+
+    knots: Float[Tensor, "m 3 4"]
 
     def __init__(
         self, knots: Float[Tensor, "m 3 4"], start_us: int, end_us: int, clock: Clock
@@ -207,7 +222,7 @@ class LearnedKnots(nn.Module):
     of a motion-capture or SfM trajectory can be refined together with the scene.
     """
 
-    def __init__(self, base: nn.Module, *, knots: int, tracks: int = 1) -> None:
+    def __init__(self, base: Trajectory, *, knots: int, tracks: int = 1) -> None:
         super().__init__()
         if knots < 4:
             raise CaptureError("a cubic B-spline needs at least 4 knots", got=knots)
@@ -234,11 +249,14 @@ class LearnedKnots(nn.Module):
 class Moved(nn.Module):
     """A trajectory seen from another world: scaled, turned and shifted."""
 
-    def __init__(self, base: nn.Module, change: Similarity) -> None:
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, "3"]
+
+    def __init__(self, base: Trajectory, change: Similarity) -> None:
         super().__init__()
         self.base, self.change = base, change
-        self.register_buffer("rotation", torch.from_numpy(change.rotation), persistent=False)
-        self.register_buffer("translation", torch.from_numpy(change.translation), persistent=False)
+        self.register_buffer("rotation", torch.as_tensor(change.rotation), persistent=False)
+        self.register_buffer("translation", torch.as_tensor(change.translation), persistent=False)
 
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
