@@ -14,6 +14,7 @@ def test_middle_and_duration():
     assert exposure.middle_us.tolist() == [2, 12, 7]
     assert exposure.duration_us.tolist() == [4, 5, 0]
     assert exposure.instant.tolist() == [False, False, True]
+    assert exposure.window(1) == (10, 15)
 
 
 def test_the_middle_of_late_times_does_not_overflow():

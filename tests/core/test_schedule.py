@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from sharpfield.core import Group
-from sharpfield.core.schedule import constant, cosine, exponential, linear, staircase
+from sharpfield.core.schedule import constant, cosine, exponential, linear, scaled, staircase
 
 
 @pytest.mark.parametrize("make", [linear, cosine])
@@ -24,6 +24,11 @@ def test_between_it_only_rises(make):
 
 def test_constant():
     assert {constant(0.3)(step) for step in (0, 7, 10**9)} == {0.3}
+
+
+def test_scaled_is_the_same_schedule_times_a_number():
+    at, tenfold = exponential(1.0, 0.1, until=10), scaled(exponential(1.0, 0.1, until=10), 10.0)
+    assert [tenfold(step) for step in (0, 3, 40)] == [10 * at(step) for step in (0, 3, 40)]
 
 
 def test_linear_golden():

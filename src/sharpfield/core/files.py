@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Generator[Path]:
+def replacing(path: Path) -> Generator[Path, None, None]:
     """A temporary file beside `path` that takes its place when the block ends well.
 
     The temporary name keeps the suffix, which many writers use to choose the format. When the
@@ -29,7 +29,7 @@ def replacing(path: Path) -> Generator[Path]:
 
 
 @contextlib.contextmanager
-def replacing_folder(path: Path) -> Generator[Path]:
+def replacing_folder(path: Path) -> Generator[Path, None, None]:
     """A temporary folder beside `path` that takes its place when the block ends well.
 
     An earlier folder at `path` is moved aside first and deleted only once the new one is there.
