@@ -143,7 +143,7 @@ def deblur(
         capture: Folder of the capture.
         out: Folder for the pictures, a contact sheet and `deblur.json`.
         layout: Of the capture, if it is not recognised.
-        options: Threshold, method, instants.
+        options: Method, instants.
     """
     deblur_to(read(capture, layout=layout), out, options)
     Console().print(f"Sharp frames are in {out}", highlight=False)

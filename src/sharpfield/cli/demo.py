@@ -109,7 +109,7 @@ def _compete(
         contender.recipe, recipe_named(contender.recipe)(), "draft", capture=capture, device=where
     )
     started = Started(contender.recipe, recipe, str(source.resolve()), seed, contender.use)
-    options = Options(minutes=minutes)
+    options = Options(minutes=minutes, validate_every=200)
     start(started, capture, run, options, device=where, console=console)
     # All are measured against the same capture: blurry input, sharp truth.
     opened = open_run(run, capture=None, device=where)

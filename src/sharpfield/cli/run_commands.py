@@ -12,7 +12,7 @@ from rich.progress import track
 from tyro.conf import Positional
 
 from sharpfield.captures.read import read
-from sharpfield.cli.runs import device_named, measure, open_run, start
+from sharpfield.cli.runs import Reading, device_named, measure, open_run, start
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation import Measuring, Refinement, camera_path, refine_poses, write_film
 from sharpfield.metrics.lpips import load_lpips
@@ -39,7 +39,7 @@ class Choice:
     """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
 
 
-CHOICE, OPTIONS = Choice(), Options()
+CHOICE, OPTIONS, READING = Choice(), Options(), Reading()
 
 
 def train(
@@ -50,6 +50,7 @@ def train(
     device: Device = "auto",
     choice: Choice = CHOICE,
     options: Options = OPTIONS,
+    reading: Reading = READING,
 ) -> None:
     """Train a recipe on a capture.
 
@@ -61,12 +62,13 @@ def train(
         device: Where to train.
         choice: Presets, streams, single numbers.
         options: How long, how often to save, how much memory.
+        reading: What to believe instead of the capture's layout.
     """
     console, where = Console(), device_named(device)
-    source = read(capture)
+    source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
-    started = Started(recipe, made, str(capture.resolve()), seed, choice.use)
+    started = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
     ledger = start(started, source, out, options, device=where, console=console)
     if ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.", highlight=False)
@@ -95,10 +97,10 @@ def evaluate(
     lpips = None
     if lpips_backbone is not None and lpips_linear is not None:
         lpips = load_lpips(lpips_backbone, lpips_linear)
-    poses, stated = {}, {}
+    poses, stated = {}, {"near_plane_removal": opened.started.recipe.volume.clear_before}
     if refine is not None:
         found = refine_poses(opened.model, opened.capture, how=refine)
-        poses, stated = found.poses, {"pose_refinement": found.protocol}
+        poses, stated = found.poses, {**stated, **found.protocol}
     measuring = Measuring(lpips=lpips, poses=poses, stated=stated)
     metrics = measure(opened, run, console, measuring=measuring)
     mean = {name: value for name, value in metrics["mean"].items() if value is not None}

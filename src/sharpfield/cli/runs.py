@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from rich.console import Console
@@ -27,6 +27,31 @@ from sharpfield.training import (
 )
 
 STREAMS = ("frames", "events")
+
+VALIDATED = 2
+"""Held-out views rendered for the curve that is drawn while training."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How to read a capture, where its layout is not to be believed."""
+
+    layout: str | None = None
+    """By default it is recognised."""
+    event_unit: str | None = None
+    """Unit of event times: ns, us, ms or s."""
+    missing: Literal["error", "skip"] | None = None
+    """What to do about images that are named but not there."""
+    encoding: str | None = None
+    """How stored values relate to light: linear, gamma2.2 or srgb."""
+    hold_out: str | None = None
+    """Frames to hold out: every:8, last:5 or none."""
+    threshold: float | None = None
+    """Contrast threshold of both signs."""
+
+    def given(self) -> dict[str, Any]:
+        """What was not left open."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -119,7 +144,7 @@ def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") ->
             got=source,
             do="say where it is now with --capture",
         )
-    whole = read(source)
+    whole = read(source, **started.reading)
     model = started.recipe.lasting(ledger.planned_steps).build(
         used(whole, started.use), started.seed
     )

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import types
 import typing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ class Started:
     seed: int
     use: tuple[str, ...] = ("frames", "events")
     """Which streams of the capture were used."""
+    reading: dict[str, Any] = field(default_factory=dict)
+    """How the capture was read, where its layout was not believed: options of `captures.read`."""
 
     def settings(self) -> dict[str, Any]:
         """As JSON; the length of the schedule is the run's own."""
@@ -36,6 +38,7 @@ class Started:
             "capture": self.capture,
             "seed": self.seed,
             "use": list(self.use),
+            "reading": self.reading,
             "options": dataclasses.asdict(self.recipe),
         }
 
@@ -57,7 +60,12 @@ def read_started(run: Path) -> Started:
         table = json.loads(path.read_text())
         recipe = from_table(recipe_named(table["recipe"]), table["options"])
         return Started(
-            table["recipe"], recipe, table["capture"], int(table["seed"]), tuple(table["use"])
+            table["recipe"],
+            recipe,
+            table["capture"],
+            int(table["seed"]),
+            tuple(table["use"]),
+            dict(table["reading"]),
         )
     except FileNotFoundError:
         raise RunError(

@@ -90,7 +90,7 @@ class Volume(nn.Module):
         self.field = _field(options, box, self.capture.camera, seed)
         if isinstance(self.field, VoxelGrid):
             self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
-            self.view = self.train_view
+            self.view = replace(self.train_view, clear_before=options.clear_before)
             return
         how = Compositing(
             activation=ACTIVATIONS[options.density],

@@ -39,6 +39,8 @@ class EvenSteps:
     field: Grid
     space: Space
     samples: int = 96
+    clear_before: float = 0.0
+    """In evaluation, nothing before this ray parameter is seen."""
 
     def __call__(
         self, rays: Rays, generator: Generator | None = None, *, samples: bool = False
@@ -57,10 +59,11 @@ class EvenSteps:
         return found.reshape(*rays.shape)
 
     def _depths(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "b s"]:
+        near, far = self.space.near, self.space.far
         if generator is None:
             place = stepfun.even_positions(rays.shape, 2 * self.samples + 1, rays.device)
             place = place[:, 1::2]  # middles of the steps
+            place = place[:, near + (far - near) * place[0] > self.clear_before]
         else:
             place = stepfun.stratified_positions(rays.shape, self.samples, generator)
-        near, far = self.space.near, self.space.far
         return (near + (far - near) * place).contiguous()
