@@ -72,15 +72,19 @@ def read_started(run: Path) -> Started:
             "this is not a run", where=run, got=f"no {FILE}", do="name a folder that `train` made"
         ) from None
     except (ValueError, TypeError, KeyError) as error:
-        raise RunError("cannot be read", where=path, got=error, do="train anew") from None
+        said = error.args[0] if error.args else error
+        raise RunError("cannot be read", where=path, got=said, do="train anew") from None
 
 
-def from_table(kind: type, table: dict[str, Any]) -> Any:
+def from_table(kind: type, table: Any) -> Any:
     """A dataclass from nested plain values; unknown keys are errors.
 
     Raises:
         KeyError: The table names something the dataclass does not have.
+        TypeError: It is not a table.
     """
+    if not isinstance(table, dict):
+        raise TypeError(f"{kind.__name__} needs a table of options, not {table!r}")
     hints = typing.get_type_hints(kind)
     fields = {f.name for f in dataclasses.fields(kind)}
     if unknown := table.keys() - fields:

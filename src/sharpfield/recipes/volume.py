@@ -86,7 +86,7 @@ class Volume(nn.Module):
         self.path = self.capture.trajectory
         poses = reference_poses(self.capture)
         self.space = _space(options, self.capture, poses)
-        box = self.space.box(torch.from_numpy(poses).float())
+        box = self.space.box(_seen_from(self.capture, poses))
         self.field = _field(options, box, self.capture.camera, seed)
         if isinstance(self.field, VoxelGrid):
             self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
@@ -166,6 +166,13 @@ def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space
     if in_frustum:
         return Frustum(capture.camera)
     return Metric(capture.camera, capture.near, capture.far)
+
+
+def _seen_from(capture: Capture, poses: Float[np.ndarray, "n 3 4"]) -> Float[Tensor, "m 3 4"]:
+    """The poses that the scene box holds the views of: the frames', or those given without any."""
+    if capture.frames is None:
+        return torch.as_tensor(poses).float()
+    return capture.frame_pose(np.arange(len(capture.frames)))
 
 
 def _precision(name: str) -> torch.dtype:
