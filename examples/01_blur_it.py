@@ -1,0 +1,59 @@
+"""Blur is the mean of sharp light: the one formula, on a scene whose light is known.
+
+    python examples/01_blur_it.py
+
+asks which sharp rays explain each pixel (`expose`), looks up their light, and asks what the frame
+would store (`observe`), for longer and longer exposures: `blur_it.png`. The last is compared with
+the frame of the simulator, which shares no code with this.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+from sharpfield.captures.images import write_image
+from sharpfield.core import Pixels, Radiance, Rays
+from sharpfield.formation import Shutter, tone_of
+from sharpfield.simulation import Rig, Scene, Timing, scene, simulate
+
+FRAME = 1
+
+
+def main(size: tuple[int, int] = (120, 80), out: Path = Path("blur_it.png")) -> None:
+    """Expose a frame for 0, 10, 25 and 50 ms."""
+    capture = simulate("garden", "glide", rig=Rig(size), timing=Timing(frames=2, test_every=0))
+    frames, camera, place = capture.needed_frames, capture.camera, scene("garden")
+    tone = tone_of(frames.encoding).encode
+    xy = camera.grid().reshape(-1, 2)  # every pixel
+    opened, closed = capture.frame_time[FRAME][:, None].expand(2, len(xy))
+    frame = torch.full((len(xy),), FRAME)
+    whole = Pixels(xy, frame, torch.zeros_like(frame), opened, closed, torch.zeros(len(xy), 3))
+
+    pictures = []
+    for part, instants in ((0.0, 1), (0.2, 5), (0.5, 13), (1.0, 25)):
+        half = part * (closed - opened) / 2
+        seen = replace(whole, open=whole.middle - half, close=whole.middle + half)
+        shutter = Shutter(camera, capture.trajectory, instants, tone)
+        rays = shutter.expose(seen)  # [b, k], each with a weight of 1/k
+        stored = shutter.observe(light_along(rays, place, 1 / camera.fx_px), seen)
+        pictures.append(np.uint8((255 * stored).round()).reshape(frames.images[FRAME].shape))
+
+    apart = np.abs(np.int16(pictures[-1]) - frames.images[FRAME])
+    print(f"from the simulated frame: {apart.mean():.2f} of 255 on average, {apart.max()} at most")
+    write_image(out, np.hstack(pictures))
+    print(f"wrote {out}")
+
+
+def light_along(rays: Rays, place: Scene, footprint_rad: float) -> Radiance:
+    """What a renderer would return."""
+    ends = (part.reshape(-1, 3).double().numpy() for part in (rays.origin, rays.direction))
+    rgb, depth = (torch.from_numpy(a) for a in place.light(*ends, footprint_rad=footprint_rad))
+    depth = depth.reshape(rays.shape)
+    return Radiance(rgb.reshape(*rays.shape, 3), depth, torch.ones_like(depth), rays.weight)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
