@@ -19,7 +19,7 @@ from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group, cosine, exponential, scaled
+from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.event_term import EventOptions, EventTerm
 from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, MotionTerm, Terms
@@ -173,11 +173,16 @@ class Model(nn.Module):
     def groups(self) -> list[Group]:
         """Networks, grids, kernel and response, all at one rate unless a recipe says otherwise."""
         recipe = self.recipe
+
+        def at(own: float | None) -> Schedule:
+            return self.rate if own is None else scaled(self.rate, own / recipe.rate)
+
         groups = self.volume.groups(self.rate, scaled(self.rate, recipe.grids_faster))
         if self.frames is not None and (kernel := tuple(self.frames.parameters())):
-            slower = 1.0 if recipe.kernel.rate is None else recipe.kernel.rate / recipe.rate
-            groups.append(Group("kernel", kernel, scaled(self.rate, slower)))
-        return groups + (self.events.groups(self.rate) if self.events is not None else [])
+            groups.append(Group("kernel", kernel, at(recipe.kernel.rate)))
+        if self.events is not None:
+            groups += self.events.groups(at(recipe.events.rate))
+        return groups
 
     def _frame_term(self) -> KernelTerm | MotionTerm:
         recipe, volume = self.recipe, self.volume

@@ -42,6 +42,8 @@ class EventOptions:
     """Pairs of successive events drawn per step."""
     threshold: tuple[float, float] | None = None
     """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
+    rate: float | None = None
+    """First learning rate of response and thresholds; None for that of everything."""
     learn_threshold: bool = False
     """Refine one threshold for each sign (with frames only: events alone cannot tell)."""
     response: Literal["linear", "gamma", "learned", "residual"] = "learned"

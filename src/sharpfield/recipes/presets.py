@@ -66,6 +66,9 @@ def physical(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
 GRID_RATE = 0.2
 """Learning rate of a dense grid, whose cells are density and colour themselves."""
 
+NETWORK_RATE = 5e-3
+"""Learning rate of what is learned beside it: the published one."""
+
 DRAFT: dict[str, Any] = {"kind": "voxels", "voxels": (0, 0), "samples": (96, 0), "noise": 0.0}
 
 STANDARD: dict[str, Any] = {
@@ -97,8 +100,10 @@ def draft(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
         smooth=0.0,
         volume=replace(recipe.volume, **DRAFT),
         frames=frames,
-        kernel=replace(recipe.kernel, rate=recipe.rate),
-        events=replace(recipe.events, pairs=512, weight=2 * recipe.events.weight),
+        kernel=replace(recipe.kernel, rate=NETWORK_RATE),
+        events=replace(
+            recipe.events, pairs=512, weight=2 * recipe.events.weight, rate=NETWORK_RATE
+        ),
     )
 
 
