@@ -13,19 +13,23 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.fast._kernel import empty, kernel, memory, share, spread
+from sharpfield.ops.fast._lanes import lanes_for, load, store, total, zeros
 from sharpfield.ops.hash_grid import PRIMES, HashLayout, hash_features
 
-PRIME_Y, PRIME_Z = np.uint64(PRIMES[1]), np.uint64(PRIMES[2])
+BLOCK = 1024
+"""Points whose features stay in the cache from level to level."""
 
 
 class _Levels(NamedTuple):
     """A `HashLayout` as kernels see it."""
 
     cells: np.ndarray
-    entries: np.ndarray
-    hashed: np.ndarray
     starts: np.ndarray
+    strides: np.ndarray
+    """`[level, 3]`: what a step along each axis adds, to a dense entry or before mixing."""
+    masks: np.ndarray
+    """Entries minus one where hashed, 0 where dense."""
 
 
 @hash_features.accelerate("cpu", needs="numba")
@@ -40,14 +44,9 @@ class _HashFeatures(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, layout: HashLayout) -> Tensor:
         ctx.save_for_backward(points, table)
-        ctx.levels = _Levels(
-            np.array(layout.cells),
-            np.array(layout.entries),
-            np.array(layout.hashed),
-            np.array(layout.starts),
-        )
-        out = points.new_empty(len(points), len(layout.cells), table.shape[1])
-        spread(_gather, memory(points), memory(table), ctx.levels, memory(out))
+        ctx.levels, ctx.lanes = _levels(layout), lanes_for(table.shape[1])
+        out = empty(points, len(points), len(layout.cells), table.shape[1])
+        spread(_gather, memory(points), memory(table), ctx.levels, ctx.lanes, memory(out))
         return out.flatten(1)
 
     @staticmethod
@@ -58,17 +57,25 @@ class _HashFeatures(torch.autograd.Function):
         of_points = of_table = None
         if ctx.needs_input_grad[0]:
             of_points = torch.zeros_like(points)
-            arrays = memory(points), memory(table), ctx.levels, memory(grad), memory(of_points)
-            spread(_slope, *arrays)
+            arrays = memory(points), memory(table), ctx.levels, ctx.lanes
+            spread(_slope, *arrays, memory(grad), memory(of_points))
         if ctx.needs_input_grad[1]:
             of_table = np.zeros_like(memory(table))
-            spread(_scatter, memory(points), ctx.levels, memory(grad), of_table)
+            spread(_scatter, memory(points), ctx.levels, ctx.lanes, memory(grad), of_table)
             of_table = torch.from_numpy(of_table)
         return of_points, of_table, None
 
 
+def _levels(layout: HashLayout) -> _Levels:
+    dense = [(1, cells + 1, (cells + 1) ** 2) for cells in layout.cells]
+    strides = [PRIMES if hashed else d for hashed, d in zip(layout.hashed, dense, strict=True)]
+    sizes = np.array(layout.entries) - 1
+    masks = np.where(layout.hashed, sizes, 0)
+    return _Levels(np.array(layout.cells), np.array(layout.starts), np.array(strides), masks)
+
+
 @kernel
-def _locate_along(x, cells):
+def _locate(x, cells):
     """The cell below a place along one axis, and how far past it the place is."""
     place = ((-1.0 if x < -1.0 else 1.0 if x > 1.0 else x) + 1.0) * 0.5 * cells
     # Not a number stays one, in how far.
@@ -77,23 +84,21 @@ def _locate_along(x, cells):
 
 
 @kernel
-def _locate(point, cells):
+def _locate_all(points, point, cells):
     """The lowest corner of the cube around a point, and how far past it the point is."""
-    x, past_x = _locate_along(point[0], cells)
-    y, past_y = _locate_along(point[1], cells)
-    z, past_z = _locate_along(point[2], cells)
+    x, past_x = _locate(points[point, 0], cells)
+    y, past_y = _locate(points[point, 1], cells)
+    z, past_z = _locate(points[point, 2], cells)
     return (x, y, z), (past_x, past_y, past_z)
 
 
 @kernel
-def _entry(low, corner, levels, level):
-    """Where a corner of a cube lies in the table; bit 2, 1, 0 of `corner` is x, y, z."""
-    x, y, z = low[0] + (corner >> 2), low[1] + (corner >> 1 & 1), low[2] + (corner & 1)
-    if levels.hashed[level]:
-        mixed = np.uint64(x) ^ (np.uint64(y) * PRIME_Y) ^ (np.uint64(z) * PRIME_Z)
-        return levels.starts[level] + np.int64(mixed % np.uint64(levels.entries[level]))
-    row = levels.cells[level] + 1
-    return levels.starts[level] + x + row * (y + row * z)
+def _entry(low, corner, strides, mask):
+    """Where a corner of a cube lies in its level; bits 2, 1, 0 of `corner` are x, y, z."""
+    x = (low[0] + (corner >> 2)) * strides[0]
+    y = (low[1] + (corner >> 1 & 1)) * strides[1]
+    z = (low[2] + (corner & 1)) * strides[2]
+    return (x ^ y ^ z) & mask if mask else x + y + z
 
 
 @kernel
@@ -107,51 +112,69 @@ def _factors(past, corner):
 
 
 @kernel
-def _gather(worker, workers, points, table, levels, out):
+def _level(levels, level):
+    """Cells, strides, mask and start of a level."""
+    strides = (levels.strides[level, 0], levels.strides[level, 1], levels.strides[level, 2])
+    return levels.cells[level], strides, levels.masks[level], levels.starts[level]
+
+
+@kernel
+def _gather(worker, workers, points, table, levels, lanes, out):
     """Write the features of a worker's points into `out [n, level, f]`."""
-    number = out.dtype.type
-    for point in range(*share(worker, workers, points.shape[0])):
-        for level in range(levels.cells.shape[0]):
-            low, past = _locate(points[point], levels.cells[level])
-            out[point, level] = 0
-            for corner in range(8):
-                fx, fy, fz = _factors(past, corner)
-                entry, weight = _entry(low, corner, levels, level), number(fx * fy * fz)
-                for feature in range(table.shape[1]):
-                    out[point, level, feature] += weight * table[entry, feature]
+    first, stop = share(worker, workers, points.shape[0])
+    number, count, features = out.dtype.type, out.shape[1], out.shape[2]
+    for block in range(first, stop, BLOCK):
+        for level in range(count):
+            cells, strides, mask, start = _level(levels, level)
+            for point in range(block, min(block + BLOCK, stop)):
+                low, past = _locate_all(points, point, cells)
+                for feature in range(0, features, len(lanes)):
+                    found = zeros(table, lanes)
+                    for corner in range(8):
+                        fx, fy, fz = _factors(past, corner)
+                        entry = start + _entry(low, corner, strides, mask)
+                        row = load(table, entry * features + feature, lanes)
+                        found += row * number(fx * fy * fz)
+                    store(out, (point * count + level) * features + feature, found)
 
 
 @kernel
-def _scatter(worker, workers, points, levels, grad, out):
+def _scatter(worker, workers, points, levels, lanes, grad, out):
     """Add the gradients of a worker's levels to `out [n, f]`."""
-    number = out.dtype.type
-    for level in range(worker, levels.cells.shape[0], workers):
+    number, count, features = out.dtype.type, grad.shape[1], grad.shape[2]
+    for level in range(worker, count, workers):
+        cells, strides, mask, start = _level(levels, level)
         for point in range(points.shape[0]):
-            low, past = _locate(points[point], levels.cells[level])
-            for corner in range(8):
-                fx, fy, fz = _factors(past, corner)
-                entry, weight = _entry(low, corner, levels, level), number(fx * fy * fz)
-                for feature in range(out.shape[1]):
-                    out[entry, feature] += weight * grad[point, level, feature]
+            low, past = _locate_all(points, point, cells)
+            for feature in range(0, features, len(lanes)):
+                arrived = load(grad, (point * count + level) * features + feature, lanes)
+                for corner in range(8):
+                    fx, fy, fz = _factors(past, corner)
+                    entry = start + _entry(low, corner, strides, mask)
+                    at = entry * features + feature
+                    store(out, at, load(out, at, lanes) + arrived * number(fx * fy * fz))
 
 
 @kernel
-def _slope(worker, workers, points, table, levels, grad, out):
-    """Write the gradients of a worker's points to `out [n, 3]`."""
+def _slope(worker, workers, points, table, levels, lanes, grad, out):
+    """Add the gradients of a worker's points to `out [n, 3]`."""
+    count, features = grad.shape[1], grad.shape[2]
     for point in range(*share(worker, workers, points.shape[0])):
         by_x = by_y = by_z = 0.0
-        for level in range(levels.cells.shape[0]):
-            low, past = _locate(points[point], levels.cells[level])
-            scale = 0.5 * levels.cells[level]
+        for level in range(count):
+            cells, strides, mask, start = _level(levels, level)
+            low, past = _locate_all(points, point, cells)
             for corner in range(8):
-                entry, arrived = _entry(low, corner, levels, level), 0.0
-                for feature in range(table.shape[1]):
-                    arrived += grad[point, level, feature] * table[entry, feature]
+                entry = start + _entry(low, corner, strides, mask)
+                dot = zeros(table, lanes)
+                for feature in range(0, features, len(lanes)):
+                    arrived = load(grad, (point * count + level) * features + feature, lanes)
+                    dot += arrived * load(table, entry * features + feature, lanes)
                 fx, fy, fz = _factors(past, corner)
-                by_x += arrived * scale * fy * fz * (1.0 if corner >> 2 else -1.0)
-                by_y += arrived * scale * fx * fz * (1.0 if corner >> 1 & 1 else -1.0)
-                by_z += arrived * scale * fx * fy * (1.0 if corner & 1 else -1.0)
-        inside = np.abs(points[point]) <= 1.0
-        out[point, 0] = by_x if inside[0] else 0.0
-        out[point, 1] = by_y if inside[1] else 0.0
-        out[point, 2] = by_z if inside[2] else 0.0
+                slope = total(dot) * 0.5 * cells
+                by_x += slope * fy * fz * (1.0 if corner >> 2 else -1.0)
+                by_y += slope * fx * fz * (1.0 if corner >> 1 & 1 else -1.0)
+                by_z += slope * fx * fy * (1.0 if corner & 1 else -1.0)
+        out[point, 0] = by_x if abs(points[point, 0]) <= 1.0 else 0.0
+        out[point, 1] = by_y if abs(points[point, 1]) <= 1.0 else 0.0
+        out[point, 2] = by_z if abs(points[point, 2]) <= 1.0 else 0.0
