@@ -14,11 +14,11 @@ from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Float
-from numba import njit, prange
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.composite import LEAK, weigh
+from sharpfield.ops.fast._kernel import kernel, memory, share, spread
 
 
 @weigh.accelerate("cpu", needs="numba")
@@ -36,7 +36,7 @@ class _Weigh(torch.autograd.Function):
         if opaque_end:
             clear[..., -1] = 0
         weights = torch.empty_like(clear)
-        _forward(_rows(clear), _rows(weights))
+        spread(_forward, _rows(clear), _rows(weights))
         ctx.save_for_backward(density, delta, clear, weights)
         return weights
 
@@ -47,7 +47,8 @@ class _Weigh(torch.autograd.Function):
     ) -> tuple[Tensor | None, Tensor | None, None]:
         density, delta, clear, weights = ctx.saved_tensors
         of_depth = torch.empty_like(clear)
-        _backward(_rows(clear), _rows(weights), _rows(gradients[0].contiguous()), _rows(of_depth))
+        arrived = gradients[0].contiguous()
+        spread(_backward, _rows(clear), _rows(weights), _rows(arrived), _rows(of_depth))
         return (
             of_depth * delta if ctx.needs_input_grad[0] else None,
             of_depth * density if ctx.needs_input_grad[1] else None,
@@ -56,25 +57,25 @@ class _Weigh(torch.autograd.Function):
 
 
 def _rows(values: Tensor) -> Any:
-    return values.reshape(-1, values.shape[-1]).numpy()
+    return memory(values.reshape(-1, values.shape[-1]))
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel
 @no_type_check
-def _forward(clear, weights):
+def _forward(worker, workers, clear, weights):
     leak = clear.dtype.type(LEAK)
-    for i in prange(clear.shape[0]):
+    for i in range(*share(worker, workers, clear.shape[0])):
         passed = clear.dtype.type(1)
         for j in range(clear.shape[1]):
             weights[i, j] = (1 - clear[i, j]) * passed
             passed *= clear[i, j] + leak
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@kernel
 @no_type_check
-def _backward(clear, weights, gradient, of_depth):
+def _backward(worker, workers, clear, weights, gradient, of_depth):
     leak = clear.dtype.type(LEAK)
-    for i in prange(clear.shape[0]):
+    for i in range(*share(worker, workers, clear.shape[0])):
         behind = clear.dtype.type(0)
         for j in range(clear.shape[1] - 1, -1, -1):  # sums from the far end lose no digits
             of_depth[i, j] = -behind * clear[i, j] / (clear[i, j] + leak)
