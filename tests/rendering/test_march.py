@@ -32,11 +32,11 @@ def test_an_empty_frustum_is_closed_by_its_end() -> None:
 def test_a_wall_is_seen_where_it_stands_in_its_colour() -> None:
     grid = VoxelGrid(BOX, 8000)
     with torch.no_grad():
-        grid.cells[..., 0] = -20.0
-        middle = grid.cells.shape[0] // 2
-        grid.cells[middle:, :, :, 0] = 20.0
-        grid.cells[..., 1] = 3.0
-        grid.cells[..., 2:] = -3.0
+        grid.grids[0][..., 0] = -20.0
+        middle = grid.grids[0].shape[0] // 2
+        grid.grids[0][middle:, :, :, 0] = 20.0
+        grid.grids[0][..., 1] = 3.0
+        grid.grids[0][..., 2:] = -3.0
     seen = EvenSteps(grid, Metric(CAMERA, 1.0, 3.0), 128)(forward(4))
     assert torch.allclose(seen.opacity, torch.ones(4), atol=1e-4)
     assert torch.allclose(seen.depth, torch.full((4,), 2.0), atol=0.1)
@@ -54,7 +54,7 @@ def test_nothing_is_seen_beside_the_box() -> None:
 
 def test_jitter_comes_from_the_generator_alone() -> None:
     grid = VoxelGrid(BOX, 1000)
-    torch.nn.init.normal_(grid.cells, generator=torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(grid.grids[0], generator=torch.Generator().manual_seed(0))
     view = EvenSteps(grid, Metric(CAMERA, 1.0, 3.0), 16)
     one, same, other = (view(forward(6), generator(0, step, "x")).rgb for step in (1, 1, 2))
     assert torch.equal(one, same)

@@ -12,22 +12,33 @@ from torch import Tensor, nn
 
 from sharpfield.ops.grid import grid_shape
 
+COARSER = 4
+"""Each grid has so many times fewer cells along an axis than the next."""
+
 
 class VoxelGrid(nn.Module):
     """Raw density and colour at the cells of a box; all zero at first: thin grey fog.
 
+    Grids of several sizes add up: what is smooth is learned by few cells that many rays pass.
+
     Args:
         box: Low and high corner of the scene in the renderer's space.
-        voxels: Budget of cells.
+        voxels: Budget of cells of the finest grid.
+        levels: How many grids.
     """
 
     box: Float[Tensor, "2 3"]
 
-    def __init__(self, box: Float[Tensor, "2 3"], voxels: int) -> None:
+    def __init__(self, box: Float[Tensor, "2 3"], voxels: int, levels: int = 2) -> None:
         super().__init__()
         self.register_buffer("box", box.float(), persistent=False)
-        nx, ny, nz = grid_shape(box, voxels)
-        self.cells = nn.Parameter(torch.zeros(nz, ny, nx, 4))
+        budgets = [voxels // COARSER ** (3 * level) for level in range(levels)]
+        shapes = [grid_shape(box, max(budget, 8))[::-1] for budget in budgets]
+        self.grids = nn.ParameterList([torch.zeros(*shape, 4) for shape in shapes])
+
+    def cells(self) -> list[nn.Parameter]:
+        """The grids `[d, h, w, 4]`, the finest first."""
+        return list(self.grids)
 
     def place(
         self, origin: Float[Tensor, "b 3"], direction: Float[Tensor, "b 3"]

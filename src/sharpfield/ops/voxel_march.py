@@ -8,6 +8,8 @@ outside there is nothing.
 Source: direct voxel grids, DVGO (CVPR 2022) for the activations, Plenoxels (CVPR 2022).
 """
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -22,28 +24,34 @@ THIN = -4.6
 
 @Op
 def march(
-    grid: Float[Tensor, "d h w 4"],
     origin: Float[Tensor, "b 3"],
     direction: Float[Tensor, "b 3"],
     place: Float[Tensor, "b s"],
+    grids: Sequence[Float[Tensor, "_ _ _ 4"]],
     *,
     opaque_end: bool = True,
 ) -> Float[Tensor, "b 5"]:
     """Red, green, blue, depth and opacity of rays.
 
     Args:
-        grid: Raw density, then raw colour.
         origin: In box coordinates.
         direction: Of one unit of `place`, in box coordinates.
         place: Ray parameter of the samples, ascending; each stands for one step of length 1.
+        grids: Raw density, then raw colour; grids of several sizes add up.
         opaque_end: The last sample stops all light.
     """
     points = origin[:, None] + place[..., None] * direction[:, None]
-    found = F.grid_sample(
-        grid.permute(3, 0, 1, 2)[None], points[None, None], padding_mode="zeros", align_corners=True
-    )[0, :, 0]  # [4, b, s]
     inside = (points.abs() <= 1).all(-1)
-    found = found * inside
+    looked = [
+        F.grid_sample(
+            grid.permute(3, 0, 1, 2)[None],
+            points[None, None],
+            padding_mode="zeros",
+            align_corners=True,
+        )[0, :, 0]
+        for grid in grids
+    ]
+    found = torch.stack(looked).sum(0) * inside  # [4, b, s]
     alpha = (1 - torch.exp(-F.softplus(found[0] + THIN))) * inside
     if opaque_end:
         alpha = torch.cat([alpha[:, :-1], torch.ones_like(alpha[:, -1:])], -1)
@@ -54,10 +62,10 @@ def march(
 
 
 @march.exemplify
-def _example(generator: torch.Generator, size: int) -> tuple[Tensor, ...]:
+def _example(generator: torch.Generator, size: int) -> tuple[object, ...]:
     count = 6 * size
-    grid = 2 * torch.randn(5, 6, 7, 4, generator=generator)
-    start = torch.rand(count, 3, generator=generator) - 0.5
+    grids = [2 * torch.randn(*shape, 4, generator=generator) for shape in ((5, 6, 7), (3, 2, 4))]
+    start = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, 1.1])
     toward = torch.tensor([0.0, 0.0, 1.5]) + 0.2 * torch.randn(count, 3, generator=generator)
     place = torch.rand(count, 12, generator=generator).sort(-1).values
-    return grid, start - torch.tensor([0.0, 0.0, 0.6]), toward, place
+    return start, toward, place, grids

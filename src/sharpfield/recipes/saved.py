@@ -65,7 +65,7 @@ def read_started(run: Path) -> Started:
             table["capture"],
             int(table["seed"]),
             tuple(table["use"]),
-            dict(table["reading"]),
+            dict(table.get("reading", {})),
         )
     except FileNotFoundError:
         raise RunError(

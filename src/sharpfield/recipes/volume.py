@@ -120,14 +120,14 @@ class Volume(nn.Module):
     def smoothness(self) -> Tensor:
         """Total variation of the planes and lines; zero without any."""
         if isinstance(self.field, VoxelGrid):
-            return roughness(self.field.cells)
+            return roughness(self.field.cells()[0])
         planes, lines = self.field.planes(), self.field.lines()
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
     def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
         """Parameters of the networks and of the grids."""
         if isinstance(self.field, VoxelGrid):
-            grids: tuple[nn.Parameter, ...] = (self.field.cells,)
+            grids: tuple[nn.Parameter, ...] = tuple(self.field.cells())
         else:
             grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}

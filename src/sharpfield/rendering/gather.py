@@ -21,7 +21,7 @@ from sharpfield.ops import composite, stepfun
 UNSEEN = 1e-4
 """In evaluation, colour is left out where a sample's share of the light is below this."""
 
-CHUNK = {"cpu": 1 << 13, "cuda": 1 << 19}
+CHUNK = {"cpu": 1 << 12, "cuda": 1 << 19}
 """Samples whose head runs at once."""
 
 

@@ -1,5 +1,6 @@
 """Light along rays through a voxel grid, in even steps."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -17,9 +18,8 @@ from sharpfield.ops.voxel_march import march
 class Grid(Protocol):
     """Raw density and colour in a box, see `ops.voxel_march`."""
 
-    @property
-    def cells(self) -> Tensor:
-        """The grid itself."""
+    def cells(self) -> Sequence[Tensor]:
+        """Grids that add up."""
         ...
 
     def place(
@@ -49,10 +49,10 @@ class EvenSteps:
         flat = rays.reshape(-1)
         origin, direction = self.field.place(*self.space.warp(flat))
         seen = march(
-            self.field.cells,
             origin,
             direction,
             self._depths(flat, generator),
+            self.field.cells(),
             opaque_end=isinstance(self.space, Frustum),
         )
         found = Radiance(seen[:, :3], seen[:, 3], seen[:, 4], flat.weight)

@@ -6,6 +6,7 @@ do not depend on the number of threads. A ray ends once next to nothing gets thr
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,42 +30,49 @@ FAINT = 1e-7
 
 @march.accelerate("cpu", needs="numba")
 def _(
-    grid: Float[Tensor, "d h w 4"],
     origin: Float[Tensor, "b 3"],
     direction: Float[Tensor, "b 3"],
     place: Float[Tensor, "b s"],
+    grids: Sequence[Float[Tensor, "_ _ _ 4"]],
     *,
     opaque_end: bool = True,
 ) -> Float[Tensor, "b 5"]:
-    if origin.requires_grad or direction.requires_grad or grid.dtype != torch.float32:
-        return march.reference(grid, origin, direction, place, opaque_end=opaque_end)
-    rays = [x.detach().contiguous() for x in (origin, direction, place)]
-    return _March.apply(grid.contiguous(), *rays, opaque_end)
+    moving = any(x.requires_grad for x in (origin, direction, place))
+    if moving or any(grid.dtype != torch.float32 for grid in grids):
+        return march.reference(origin, direction, place, grids, opaque_end=opaque_end)
+    rays = [x.contiguous() for x in (origin, direction, place)]
+    return _March.apply(*rays, opaque_end, *[grid.contiguous() for grid in grids])
 
 
 class _March(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, grid: Tensor, origin: Tensor, direction: Tensor, place: Tensor, opaque_end: bool
+        ctx: Any,
+        origin: Tensor,
+        direction: Tensor,
+        place: Tensor,
+        opaque_end: bool,
+        *grids: Tensor,
     ) -> Tensor:
-        ctx.save_for_backward(grid, origin, direction, place)
+        ctx.save_for_backward(origin, direction, place, *grids)
         ctx.opaque_end = opaque_end
         out = torch.empty(len(origin), 5)
         rays = (memory(origin), memory(direction), memory(place))
-        spread(_forward, memory(grid), rays, opaque_end, memory(out))
+        spread(_forward, tuple(memory(grid) for grid in grids), rays, opaque_end, memory(out))
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        grid, origin, direction, place = ctx.saved_tensors
+        origin, direction, place, *grids = ctx.saved_tensors
         # Numpy asks for huge pages, which are several times faster to fill.
-        sums = np.empty((PARTS, *grid.shape), np.float32)
+        sums = tuple(np.empty((PARTS, *grid.shape), np.float32) for grid in grids)
         rays = (memory(origin), memory(direction), memory(place))
         wanted = memory(gradients[0].contiguous())
-        spread(_backward, memory(grid), rays, ctx.opaque_end, wanted, sums)
+        cells = tuple(memory(grid) for grid in grids)
+        spread(_backward, cells, rays, ctx.opaque_end, wanted, sums)
         spread(_merge, sums)
-        return torch.from_numpy(sums[0]), None, None, None, None
+        return None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
 
 
 @kernel
@@ -87,8 +95,8 @@ def _locate(grid, x, y, z, corner, weight):
 
 @kernel
 def _look(grid, corner, weight, found):
-    """Trilinear values at a located point."""
-    a = b = c = d = np.float32(0.0)
+    """Add the trilinear values at a located point."""
+    a, b, c, d = found[0], found[1], found[2], found[3]
     for k in range(2):
         wz = weight[2] if k else np.float32(1.0) - weight[2]
         for j in range(2):
@@ -114,33 +122,38 @@ def _sigmoid(raw):
 
 
 @kernel
-def _walk(grid, rays, ray, opaque_end, scratch):
+def _find(grids, rays, ray, z, scratch):
+    """Locate a point of a ray in every grid; False outside."""
+    origin, direction = rays[0][ray], rays[1][ray]
+    corner, weight = scratch[1], scratch[2]
+    x, y = origin[0] + z * direction[0], origin[1] + z * direction[1]
+    w = origin[2] + z * direction[2]
+    inside = True
+    for level in range(len(grids)):
+        inside = _locate(grids[level], x, y, w, corner[level], weight[level])
+    return inside
+
+
+@kernel
+def _walk(grids, rays, ray, opaque_end, scratch):
     """Fill the trace of one ray; returns how many samples it has.
 
     Columns of the trace: number of the sample, opacity, weight, softplus' slope, three colours.
     """
-    origin, direction, place = rays[0][ray], rays[1][ray], rays[2][ray]
+    place = rays[2][ray]
     trace, corner, weight, found = scratch
     samples = len(place)
     clear = 1.0
     kept = 0
     for s in range(samples):
         last = opaque_end and s == samples - 1
-        z = place[s]
-        inside = _locate(
-            grid,
-            origin[0] + z * direction[0],
-            origin[1] + z * direction[1],
-            origin[2] + z * direction[2],
-            corner,
-            weight,
-        )
-        if inside:
-            _look(grid, corner, weight, found)
-        elif last:
-            found[:] = 0.0
-        else:
+        inside = _find(grids, rays, ray, place[s], scratch)
+        if not (inside or last):
             continue
+        found[:] = 0.0
+        if inside:
+            for level in range(len(grids)):
+                _look(grids[level], corner[level], weight[level], found)
         raw = found[0] + THIN
         alpha = 1.0 if last else 1.0 - math.exp(-_softplus(raw))
         row = trace[kept]
@@ -160,20 +173,24 @@ def _walk(grid, rays, ray, opaque_end, scratch):
 
 
 @kernel
-def _scratch(samples):
-    """Room for the trace of a ray, a located point and what was found there."""
-    trace = np.empty((samples, 7))
-    return trace, np.empty(3, np.int64), np.empty(3, np.float32), np.empty(4, np.float32)
+def _scratch(samples, levels):
+    """Room for the trace of a ray, a point located in each grid, and what was found there."""
+    return (
+        np.empty((samples, 7)),
+        np.empty((levels, 3), np.int64),
+        np.empty((levels, 3), np.float32),
+        np.empty(4, np.float32),
+    )
 
 
 @kernel
-def _forward(worker, workers, grid, rays, opaque_end, out):
+def _forward(worker, workers, grids, rays, opaque_end, out):
     """Colour, depth and opacity of a share of the rays."""
     place = rays[2]
-    scratch = _scratch(place.shape[1])
+    scratch = _scratch(place.shape[1], len(grids))
     trace = scratch[0]
     for ray in range(*share(worker, workers, len(out))):
-        kept = _walk(grid, rays, ray, opaque_end, scratch)
+        kept = _walk(grids, rays, ray, opaque_end, scratch)
         red = green = blue = depth = opacity = 0.0
         for k in range(kept):
             w = trace[k, 2]
@@ -203,15 +220,16 @@ def _add(grid, corner, weight, a, b, c, d):
 
 
 @kernel
-def _backward(worker, workers, grid, rays, opaque_end, wanted, sums):
-    """Gradient of the grid; part after part, each into its own sum."""
-    origin, direction, place = rays
-    scratch = _scratch(place.shape[1])
+def _backward(worker, workers, grids, rays, opaque_end, wanted, sums):
+    """Gradients of the grids; part after part, each into its own sum."""
+    place = rays[2]
+    scratch = _scratch(place.shape[1], len(grids))
     trace, corner, weight = scratch[0], scratch[1], scratch[2]
-    for part in range(worker, len(sums), workers):
-        sums[part] = 0.0
-        for ray in range(*share(part, len(sums), len(wanted))):
-            kept = _walk(grid, rays, ray, opaque_end, scratch)
+    for part in range(worker, PARTS, workers):
+        for level in range(len(grids)):
+            sums[level][part] = 0.0
+        for ray in range(*share(part, PARTS, len(wanted))):
+            kept = _walk(grids, rays, ray, opaque_end, scratch)
             g = wanted[ray]
             behind = 0.0  # sum over later samples of weight times what it adds to the loss
             for k in range(kept - 1, -1, -1):
@@ -226,19 +244,13 @@ def _backward(worker, workers, grid, rays, opaque_end, wanted, sums):
                     front = row[2] / row[1] if row[1] > 0.0 else 0.0
                     slope = row[3] * (front * through * value - behind)
                 behind += row[2] * value
-                inside = _locate(
-                    grid,
-                    origin[ray, 0] + z * direction[ray, 0],
-                    origin[ray, 1] + z * direction[ray, 1],
-                    origin[ray, 2] + z * direction[ray, 2],
-                    corner,
-                    weight,
-                )
-                if inside:
+                if not _find(grids, rays, ray, z, scratch):
+                    continue
+                for level in range(len(grids)):
                     _add(
-                        sums[part],
-                        corner,
-                        weight,
+                        sums[level][part],
+                        corner[level],
+                        weight[level],
                         np.float32(slope),
                         np.float32(row[2] * g[0] * row[4] * (1.0 - row[4])),
                         np.float32(row[2] * g[1] * row[5] * (1.0 - row[5])),
@@ -249,6 +261,8 @@ def _backward(worker, workers, grid, rays, opaque_end, wanted, sums):
 @kernel
 def _merge(worker, workers, sums):
     """Add all parts to the first, slice by slice."""
-    for z in range(*share(worker, workers, sums.shape[1])):
-        for part in range(1, len(sums)):
-            sums[0, z] += sums[part, z]
+    for level in range(len(sums)):
+        total = sums[level]
+        for z in range(*share(worker, workers, total.shape[1])):
+            for part in range(1, PARTS):
+                total[0, z] += total[part, z]
