@@ -26,11 +26,11 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "notebook.md"]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-INDENTED = re.compile(r"^ {4,}(sharpfield .*)$", re.MULTILINE)
+INDENTED = re.compile(r"^ {4,}(sharpfield [a-z].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(sharpfield [^`]+)`")
 CHANGES = re.compile(r"`--change ([^`]+)`")
 LINK = re.compile(r"\]\(([^)\s]+)\)|<img[^>]* src=\"([^\"]+)\"")
-COMMAND = re.compile(r"^\$? ?(sharpfield .*)$", re.MULTILINE)
+COMMAND = re.compile(r"^(sharpfield [a-z].*)$", re.MULTILINE)
 
 Call = tuple[str, dict[str, Any]]
 
@@ -52,7 +52,7 @@ def commands() -> list[tuple[str, str]]:
         text = FENCE.sub("", page.read_text())
         fenced = [line for block in blocks(page, "") for line in COMMAND.findall(block)]
         found += [(name(page), line) for line in fenced + INDENTED.findall(text)]
-    return [(page, line) for page, line in found if line.split()[1].islower()]
+    return found
 
 
 @pytest.fixture
