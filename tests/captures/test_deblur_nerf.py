@@ -46,7 +46,12 @@ def test_the_focal_length_follows_the_images(tmp_path):
 
 @pytest.mark.parametrize(
     ("marker", "option", "test"),
-    [(None, None, [0, 8]), ("hold=4", None, [0, 4, 8]), ("hold=4", "every:3", [0, 3, 6]), (None, "none", [])],
+    [
+        (None, None, [0, 8]),
+        ("hold=4", None, [0, 4, 8]),
+        ("hold=4", "every:3", [0, 3, 6]),
+        (None, "none", []),
+    ],
 )
 def test_what_is_held_out(tmp_path, marker, option, test):
     written(tmp_path)

@@ -76,6 +76,12 @@ def test_evaluate_keeps_its_contract(trained: Path) -> None:
     assert "<html" in (trained / "report.html").read_text()
 
 
+def test_evaluate_can_refine_the_poses_first(trained: Path) -> None:
+    assert run("evaluate", trained, "--refine", "--steps", 2, "--pixels", 8, "--every", 1) == 0
+    protocol = json.loads((trained / "metrics.json").read_text())["protocol"]
+    assert protocol["pose_refinement"]
+
+
 def test_render_makes_a_film_and_pictures(trained: Path, tmp_path: Path) -> None:
     assert run("render", trained, "--out", tmp_path / "film.mp4", "--pictures", 3) == 0
     assert (tmp_path / "film.mp4").stat().st_size > 0
@@ -124,6 +130,17 @@ def test_what_the_user_can_mend_ends_with_code_2(
     said = capsys.readouterr().err
     assert message in said
     assert "Traceback" not in said
+
+
+def test_an_unknown_number_of_a_recipe_is_named(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--out", recorded.parent / "never", "--change", "event.pairs=3")
+    assert run("train", "ev-deblur-nerf", recorded, *words) == 2
+    said = capsys.readouterr().err
+    assert "event.pairs=3" in said
+    assert "events.pairs" in said
+    assert not (recorded.parent / "never").exists()
 
 
 def test_nanoseconds_taken_for_microseconds_are_noticed(

@@ -1,5 +1,6 @@
 """Commands about runs: train one, measure one, render one."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +16,7 @@ from sharpfield.captures.read import read
 from sharpfield.cli.runs import Reading, device_named, measure, open_run, start
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation import Measuring, Refinement, camera_path, refine_poses, write_film
+from sharpfield.evaluation.report import flat
 from sharpfield.metrics.lpips import load_lpips
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
@@ -39,7 +41,7 @@ class Choice:
     """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
 
 
-CHOICE, OPTIONS, READING = Choice(), Options(), Reading()
+CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), Reading(), Refinement()
 
 
 def train(
@@ -78,7 +80,8 @@ def evaluate(
     run: Positional[Path],
     capture: Path | None = None,
     device: Device = "auto",
-    refine: Refinement | None = None,
+    refine: bool = False,
+    refinement: Refinement = REFINEMENT,
     lpips_backbone: Path | None = None,
     lpips_linear: Path | None = None,
 ) -> None:
@@ -89,6 +92,7 @@ def evaluate(
         capture: Where the capture is, if it moved.
         device: Where to render.
         refine: Refine the held-out poses first, with the scene frozen.
+        refinement: How, if so.
         lpips_backbone: Weights file of torchvision's AlexNet or VGG16, to compute LPIPS.
         lpips_linear: Weights file of LPIPS's own linear layers.
     """
@@ -97,9 +101,10 @@ def evaluate(
     lpips = None
     if lpips_backbone is not None and lpips_linear is not None:
         lpips = load_lpips(lpips_backbone, lpips_linear)
-    poses, stated = {}, {"near_plane_removal": opened.started.recipe.volume.clear_before}
-    if refine is not None:
-        found = refine_poses(opened.model, opened.capture, how=refine)
+    volume = getattr(opened.started.recipe, "volume", None)
+    poses, stated = {}, {"near_plane_removal": getattr(volume, "clear_before", 0.0)}
+    if refine:
+        found = refine_poses(opened.model, opened.capture, how=refinement)
         poses, stated = found.poses, {**stated, **found.protocol}
     measuring = Measuring(lpips=lpips, poses=poses, stated=stated)
     metrics = measure(opened, run, console, measuring=measuring)
@@ -156,17 +161,25 @@ def changed(recipe: Any, changes: tuple[str, ...]) -> Any:
     """A recipe with some of its numbers changed by name.
 
     Raises:
-        OptionError: A change is not NAME=VALUE.
+        OptionError: A change is not NAME=VALUE, or the recipe has no such number.
     """
-    words = []
+    known, words = set(flat(dataclasses.asdict(recipe))), []
     for change in changes:
         name, equals, value = change.partition("=")
-        if not equals:
+        if not equals or name not in known:
             raise OptionError(
-                "cannot read a change of the recipe", got=change, do="write NAME=VALUE"
+                "cannot read a change of the recipe",
+                got=change,
+                do=f"write NAME=VALUE with one of {', '.join(sorted(known))}",
             )
         words += [f"--{name}", *value.split(",")]
     if not words:
         return recipe
     # Without flags, so that a boolean takes its value like every other number: NAME=False.
-    return tyro.cli(type(recipe), default=recipe, args=words, config=(tyro.conf.FlagConversionOff,))
+    return tyro.cli(
+        type(recipe),
+        prog="--change",
+        default=recipe,
+        args=words,
+        config=(tyro.conf.FlagConversionOff,),
+    )

@@ -163,6 +163,15 @@ class Recipe(Protocol):
 
     paper: ClassVar[Paper]
 
+    @property
+    def steps(self) -> int:
+        """Length of its schedule."""
+        ...
+
+    def lasting(self, steps: int) -> "Recipe":
+        """The same recipe with its whole schedule stretched or shrunk."""
+        ...
+
     def build(self, capture: "Capture", seed: int) -> Any:
         """A `Model` on one capture."""
         ...

@@ -1,8 +1,8 @@
 """NeRF: a sharp scene from frames taken as they are. The baseline that blur and events must beat.
 
 B. Mildenhall et al., *NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis*,
-ECCV 2020. With `field.kind="planes"` the same method on factored feature volumes, which learn in
-minutes what the large networks learn in hours.
+ECCV 2020. With `volume.kind` "planes" or "voxels" the same method on factored feature volumes or a
+dense grid, which learn in minutes what the large networks learn in hours.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,7 +34,7 @@ PAPER = Paper(
     departures=(
         "The scene is linear light and frames are encoded by their own response; the published"
         " code works on stored values throughout.",
-        "The default field is that of PDRF; the published networks are the preset `paper`.",
+        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light.",
     ),
 )
 
