@@ -51,6 +51,7 @@ def main() -> None:
         )
     show(rows)
     facts = {key: str(value) for key, value in vars(options).items()}
+    facts["capture"] = options.capture.name
     print(save("render_view", rows, facts))
 
 

@@ -198,6 +198,7 @@ def main() -> None:
         task = Task(PLAIN, parts, options.runs, options.threads, options.capture)
         rows += compare(task)
     facts = {key: str(value) for key, value in vars(options).items()}
+    facts["capture"] = options.capture.name
     print(save("training_step", rows, facts))
 
 
