@@ -18,8 +18,11 @@ from sharpfield.preparation.deblur import DeblurOptions, deblur
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.saved import Started
-from sharpfield.simulation import SENSORS, Rig, simulate
+from sharpfield.simulation import SENSORS, Rig, Timing, simulate
 from sharpfield.training import Options
+
+STRONG_BLUR = Timing(exposure_us=80_000, interval_us=90_000)
+"""Exposures in dim light."""
 
 TITLE = "A sharp scene from blurry frames and events"
 
@@ -46,7 +49,7 @@ def demo(
     out: Path = Path("runs/demo"),
     size: str = "120x80",
     scene: str = "garden",
-    minutes: float = 1.0,
+    minutes: float = 1.1,
     seed: int = 0,
     device: str = "auto",
 ) -> None:
@@ -63,7 +66,7 @@ def demo(
     console = Console()
     rig = Rig(parse_size(size), event_sensor=SENSORS["dvs346"])
     console.print(f"Recording the scene {scene!r} at {size}", highlight=False)
-    capture = replace(simulate(scene, rig=rig, seed=seed), name=scene)
+    capture = replace(simulate(scene, rig=rig, timing=STRONG_BLUR, seed=seed), name=scene)
     native.write(capture, out / "capture")
     sharper = with_deblurred_frames(capture)
     native.write(sharper, out / "capture-edi")

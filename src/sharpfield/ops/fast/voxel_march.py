@@ -1,5 +1,5 @@
 # pyright: basic
-"""Marching through a voxel grid on the CPU: one pass forwards, and one back that keeps nothing.
+"""Marching through voxel grids on the CPU: one pass forwards, and one back along what it met.
 
 Rays are cut into PARTS shares with a gradient grid each, which are added at the end, so that sums
 do not depend on the number of threads. A ray ends once next to nothing gets through.
@@ -23,6 +23,9 @@ PARTS = 2
 
 DARK = 1e-5
 """A ray ends when less than this share of light gets through."""
+
+COLUMNS = 7
+"""Of the trace of a ray, see `_walk`."""
 
 FAINT = 1e-7
 """The colour of a sample with a smaller share of the ray's light is not computed."""
@@ -55,10 +58,16 @@ class _March(torch.autograd.Function):
         *grids: Tensor,
     ) -> Tensor:
         ctx.save_for_backward(origin, direction, place, *grids)
-        ctx.opaque_end = opaque_end
         out = torch.empty(len(origin), 5)
         rays = (memory(origin), memory(direction), memory(place))
-        spread(_forward, tuple(memory(grid) for grid in grids), rays, opaque_end, memory(out))
+        cells = tuple(memory(grid) for grid in grids)
+        # Without gradients one trace for each worker is enough, written over by every ray.
+        learning = any(ctx.needs_input_grad)
+        traces = len(origin) if learning else torch.get_num_threads()
+        trace = np.empty((traces, place.shape[1], COLUMNS), np.float32)
+        kept = np.empty(len(origin), np.int64)
+        spread(_forward, cells, rays, (opaque_end, learning), (trace, kept), memory(out))
+        ctx.met = (trace, kept) if learning else None
         return out
 
     @staticmethod
@@ -70,7 +79,7 @@ class _March(torch.autograd.Function):
         rays = (memory(origin), memory(direction), memory(place))
         wanted = memory(gradients[0].contiguous())
         cells = tuple(memory(grid) for grid in grids)
-        spread(_backward, cells, rays, ctx.opaque_end, wanted, sums)
+        spread(_backward, cells, rays, ctx.met, wanted, sums)
         spread(_merge, sums)
         return None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
 
@@ -135,13 +144,13 @@ def _find(grids, rays, ray, z, scratch):
 
 
 @kernel
-def _walk(grids, rays, ray, opaque_end, scratch):
+def _walk(grids, rays, ray, opaque_end, trace, scratch):
     """Fill the trace of one ray; returns how many samples it has.
 
     Columns of the trace: number of the sample, opacity, weight, softplus' slope, three colours.
     """
     place = rays[2][ray]
-    trace, corner, weight, found = scratch
+    found, corner, weight = scratch
     samples = len(place)
     clear = 1.0
     kept = 0
@@ -173,24 +182,26 @@ def _walk(grids, rays, ray, opaque_end, scratch):
 
 
 @kernel
-def _scratch(samples, levels):
-    """Room for the trace of a ray, a point located in each grid, and what was found there."""
+def _scratch(levels):
+    """Room for what was found at a point, and for the point located in each grid."""
     return (
-        np.empty((samples, 7)),
+        np.empty(4, np.float32),
         np.empty((levels, 3), np.int64),
         np.empty((levels, 3), np.float32),
-        np.empty(4, np.float32),
     )
 
 
 @kernel
-def _forward(worker, workers, grids, rays, opaque_end, out):
-    """Colour, depth and opacity of a share of the rays."""
+def _forward(worker, workers, grids, rays, mode, met, out):
+    """Colour, depth and opacity of a share of the rays, and the samples that they met."""
     place = rays[2]
-    scratch = _scratch(place.shape[1], len(grids))
-    trace = scratch[0]
+    opaque_end, learning = mode
+    traces, counts = met
+    scratch = _scratch(len(grids))
     for ray in range(*share(worker, workers, len(out))):
-        kept = _walk(grids, rays, ray, opaque_end, scratch)
+        trace = traces[ray if learning else worker]
+        kept = _walk(grids, rays, ray, opaque_end, trace, scratch)
+        counts[ray] = kept
         red = green = blue = depth = opacity = 0.0
         for k in range(kept):
             w = trace[k, 2]
@@ -220,16 +231,17 @@ def _add(grid, corner, weight, a, b, c, d):
 
 
 @kernel
-def _backward(worker, workers, grids, rays, opaque_end, wanted, sums):
+def _backward(worker, workers, grids, rays, met, wanted, sums):
     """Gradients of the grids; part after part, each into its own sum."""
     place = rays[2]
-    scratch = _scratch(place.shape[1], len(grids))
-    trace, corner, weight = scratch[0], scratch[1], scratch[2]
+    traces, counts = met
+    scratch = _scratch(len(grids))
+    corner, weight = scratch[1], scratch[2]
     for part in range(worker, PARTS, workers):
         for level in range(len(grids)):
             sums[level][part] = 0.0
         for ray in range(*share(part, PARTS, len(wanted))):
-            kept = _walk(grids, rays, ray, opaque_end, scratch)
+            trace, kept = traces[ray], counts[ray]
             g = wanted[ray]
             behind = 0.0  # sum over later samples of weight times what it adds to the loss
             for k in range(kept - 1, -1, -1):
