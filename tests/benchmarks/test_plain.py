@@ -108,8 +108,8 @@ def test_the_gradients_are_ours(model: Model):
 
 
 def assert_near(found: Tensor, wanted: Tensor, name: str) -> None:
-    """To half a percent of the largest entry: sums run in another order, some cancel."""
-    off = (found - wanted).abs().max() / wanted.abs().max().clamp_min(1e-12)
+    """To half a percent of the largest entry, but for gradients that cancel to rounding."""
+    off = (found - wanted).abs().max() / wanted.abs().max().clamp_min(2e-9)
     assert off < 5e-3, f"{name}: {off:.1e}"
 
 
