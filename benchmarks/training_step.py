@@ -96,9 +96,11 @@ def recipe_for(contender: Contender, parts: int) -> EvDeblurNeRF:
     )
 
 
-def built(contender: Contender, capture: Capture, parts: int) -> tuple[Model | Plain, Optimizer]:
+def built(
+    contender: Contender, capture: Capture, parts: int, *, device: str = "cpu"
+) -> tuple[Model | Plain, Optimizer]:
     """A model and its optimizer; the parameters depend on the seed alone."""
-    model = recipe_for(contender, parts).build(capture, seed=0)
+    model = recipe_for(contender, parts).build(capture, seed=0).to(device)
     if contender == PLAIN:
         plain = Plain(model)
         return plain, Adam(plain.parameters(), lr=plain.recipe.rate)
@@ -153,8 +155,8 @@ def alone(measure_: Callable[[Task], Measured | None], task: Task) -> Measured |
         return pool.apply(measure_, (task,))
 
 
-def row(task: Task, found: Measured, against: Measured) -> Row:
-    """A line of the table, with how many times less it takes than the plain formulation."""
+def row(task: Task, found: Measured, against: Measured | None) -> Row:
+    """A line of the table, with how many times more the plain formulation takes where it fits."""
     return {
         "contender": task.contender.name,
         "batch": f"1/{task.parts}" if task.parts > 1 else "1",
@@ -162,24 +164,27 @@ def row(task: Task, found: Measured, against: Measured) -> Row:
         "peak GiB": found.peak / GIB,
         "kept GiB": found.kept / GIB,
         "loss": sum(found.losses.values()),
-        "s ratio": against.seconds / found.seconds,
-        "peak ratio": against.peak / found.peak,
-        "kept ratio": against.kept / found.kept,
+        "s ratio": against and against.seconds / found.seconds,
+        "peak ratio": against and against.peak / found.peak,
+        "kept ratio": against and against.kept / found.kept,
     }
 
 
-def compare(task: Task) -> list[Row]:
-    """Lines for all contenders at the largest part of the batch that fits for the plain one."""
-    found = alone(measure, task)
-    while found is None:
-        print(f"1/{task.parts} of the batch does not fit for the plain formulation", flush=True)
+def compare(wanted: Task) -> list[Row]:
+    """Lines for all contenders at the largest part of the batch that fits for the plain one.
+
+    Ours are measured at the wanted part too.
+    """
+    task = wanted
+    while (plain := alone(measure, task)) is None:
+        print(f"plain: 1/{task.parts} of the batch does not fit", flush=True)
         task = replace(task, parts=2 * task.parts)
-        found = alone(measure, task)
-    rows = [row(task, found, found)]
-    for contender in OURS:
-        ours = replace(task, contender=contender)
-        if (mine := alone(measure, ours)) is not None:
-            rows.append(row(ours, mine, found))
+    rows = [row(task, plain, plain)]
+    for part, against in {wanted.parts: None, task.parts: plain}.items():
+        for contender in OURS:
+            ours = replace(task, contender=contender, parts=part)
+            if (found := alone(measure, ours)) is not None:
+                rows.append(row(ours, found, against))
     show(rows)
     return rows
 

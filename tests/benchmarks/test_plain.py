@@ -96,20 +96,22 @@ def test_the_gradients_are_ours(model: Model):
     for stage, wanted in enumerate(ours):
         for name, values in wanted.items():
             for mine, other in zip(values, theirs[stage][name], strict=True):
-                assert_near(other, mine, f"{stage} {name}")
+                assert_near(other, mine, mine.abs().max(), f"{stage} {name}")
     again = {n: p.grad for n, p in model.named_parameters() if not n.startswith("volume")}
     model.zero_grad(set_to_none=True)
-    assert len(shared) > 20
-    for name, wanted in shared.items():
-        if wanted is None:
-            assert again[name] is None
-        else:
-            assert_near(again[name], wanted, name)
+    reached = {name: wanted for name, wanted in shared.items() if wanted is not None}
+    assert len(reached) > 20 and reached.keys() == {n for n, g in again.items() if g is not None}
+    for name, wanted in reached.items():
+        network = [g for n, g in reached.items() if n.split(".")[:3] == name.split(".")[:3]]
+        largest = torch.stack([g.abs().max() for g in network]).max()
+        # Softmax and normalisation cancel some of them to nothing but rounding.
+        scale = wanted.abs().max().maximum(1e-2 * largest)
+        assert_near(again[name], wanted, scale, name)
 
 
-def assert_near(found: Tensor, wanted: Tensor, name: str) -> None:
-    """To half a percent of the largest entry, but for gradients that cancel to rounding."""
-    off = (found - wanted).abs().max() / wanted.abs().max().clamp_min(2e-9)
+def assert_near(found: Tensor, wanted: Tensor, scale: Tensor, name: str) -> None:
+    """To half a percent of the scale: sums run in another order."""
+    off = (found - wanted).abs().max() / scale
     assert off < 5e-3, f"{name}: {off:.1e}"
 
 
