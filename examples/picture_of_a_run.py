@@ -1,6 +1,6 @@
 """One picture of an evaluated run: a blurry frame, its events, the rebuilt scene, the truth.
 
-python examples/03_picture_of_a_run.py runs/demo --out docs/pictures/demo.png
+python examples/picture_of_a_run.py runs/demo --out docs/pictures/demo.png
 """
 
 import argparse
