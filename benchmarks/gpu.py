@@ -30,6 +30,7 @@ from benchmarks.training_step import (
     Contender,
     built,
     captured,
+    share,
     take_step,
 )
 from sharpfield import ops
@@ -71,7 +72,7 @@ def measure(contender: Contender, capture: Capture, parts: int, runs: int) -> Ro
     of_view = milliseconds(lambda: render_view(model.render, camera, pose, 0.5), 1)
     return {
         "contender": contender.name,
-        "batch": f"1/{parts}" if parts > 1 else "1",
+        "batch": share(parts),
         "step ms": of_step,
         "peak GiB": peak / GIB,
         "view ms": of_view,
@@ -86,7 +87,7 @@ def fitting(contender: Contender, capture: Capture, runs: int) -> Row:
         try:
             return measure(contender, capture, parts, runs)
         except torch.cuda.OutOfMemoryError:
-            print(f"{contender.name}: 1/{parts} of the batch does not fit", flush=True)
+            print(f"{contender.name}: {share(parts)} of the batch does not fit", flush=True)
         # Outside the handler, whose exception would keep the tensors alive.
         parts *= 2
         gc.collect()

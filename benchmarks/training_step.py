@@ -155,11 +155,16 @@ def alone(measure_: Callable[[Task], Measured | None], task: Task) -> Measured |
         return pool.apply(measure_, (task,))
 
 
+def share(parts: int) -> str:
+    """How much of the batch, in words of a table."""
+    return f"1/{parts}" if parts > 1 else "all"
+
+
 def row(task: Task, found: Measured, against: Measured | None) -> Row:
     """A line of the table, with how many times more the plain formulation takes where it fits."""
     return {
         "contender": task.contender.name,
-        "batch": f"1/{task.parts}" if task.parts > 1 else "1",
+        "batch": share(task.parts),
         "s": found.seconds,
         "peak GiB": found.peak / GIB,
         "kept GiB": found.kept / GIB,
@@ -177,7 +182,7 @@ def compare(wanted: Task) -> list[Row]:
     """
     task = wanted
     while (plain := alone(measure, task)) is None:
-        print(f"plain: 1/{task.parts} of the batch does not fit", flush=True)
+        print(f"plain: {share(task.parts)} of the batch does not fit", flush=True)
         task = replace(task, parts=2 * task.parts)
     rows = [row(task, plain, plain)]
     for part, against in {wanted.parts: None, task.parts: plain}.items():
