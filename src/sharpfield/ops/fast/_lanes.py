@@ -176,6 +176,125 @@ def _scale(typing, row, factor):
     return row(row, row.element), generate
 
 
+@instruction
+def _divide(typing, one, other):
+    def generate(context, builder, signature, arguments):
+        return builder.fdiv(*arguments)
+
+    return one(one, other), generate
+
+
+def _everywhere(builder, factor, width):
+    """A number as a row of itself."""
+    kind = ir.VectorType(factor.type, width)
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), factor, INT32(0))
+    return builder.shuffle_vector(first, first, _indices([0] * width))
+
+
+@instruction
+def fill(typing, number, lanes):
+    """A row of the same number."""
+    row = Lanes(number, lanes.count)
+
+    def generate(context, builder, signature, arguments):
+        return _everywhere(builder, arguments[0], row.width)
+
+    return row(number, lanes), generate
+
+
+@instruction
+def count_up(typing, start, lanes):
+    """A row of `start`, `start + 1`, `start + 2`, ..."""
+    row = Lanes(start, lanes.count)
+
+    def generate(context, builder, signature, arguments):
+        steps = ir.Constant(context.get_value_type(row), [float(i) for i in range(row.width)])
+        return builder.fadd(_everywhere(builder, arguments[0], row.width), steps)
+
+    return row(start, lanes), generate
+
+
+@instruction
+def at_most(typing, row, limit):
+    """The row with numbers above a limit replaced by it."""
+
+    def generate(context, builder, signature, arguments):
+        vector, limit = arguments[0], _everywhere(builder, arguments[1], row.width)
+        return builder.select(builder.fcmp_ordered("<", vector, limit), vector, limit)
+
+    return row(row, row.element), generate
+
+
+@instruction
+def where_least(typing, row, tested, limit):
+    """The row, but zero where `tested` is less than a limit."""
+
+    def generate(context, builder, signature, arguments):
+        limit = _everywhere(builder, arguments[2], row.width)
+        enough = builder.fcmp_ordered(">=", arguments[1], limit)
+        return builder.select(enough, arguments[0], ir.Constant(limit.type, None))
+
+    return row(row, tested, row.element), generate
+
+
+@instruction
+def where_below(typing, row, tested, limit):
+    """The row, but zero where `tested` reaches a limit."""
+
+    def generate(context, builder, signature, arguments):
+        limit = _everywhere(builder, arguments[2], row.width)
+        enough = builder.fcmp_ordered("<", arguments[1], limit)
+        return builder.select(enough, arguments[0], ir.Constant(limit.type, None))
+
+    return row(row, tested, row.element), generate
+
+
+EXPONENTIAL = (
+    1.0,
+    0.6931469776,
+    0.2402224207,
+    0.05550733766,
+    0.009671513139,
+    0.001326472021,
+)
+"""2^x for -1/2 <= x <= 1/2 as a polynomial, lowest power first; off by 2e-7 of the value."""
+
+
+ROUNDING = 1.5 * 2.0**23
+
+
+@instruction
+def exponential(typing, row):
+    """The exponential of float32 numbers between -87 and 88; smaller ones give 1e-38 or less."""
+
+    def generate(context, builder, signature, arguments):
+        kind = arguments[0].type
+        bits = ir.VectorType(INT32, row.width)
+
+        def same(number):
+            return ir.Constant(kind, [number] * row.width)
+
+        def multiply_add(one, other, added):
+            return builder.fadd(builder.fmul(one, other, flags=CONTRACT), added, flags=CONTRACT)
+
+        least = same(-87.0)
+        power = builder.select(builder.fcmp_ordered(">", arguments[0], least), arguments[0], least)
+        power = builder.fmul(power, same(math.log2(math.e)))
+        # Numbers this large have no fraction: adding one and taking it away again rounds.
+        whole = builder.fsub(builder.fadd(power, same(ROUNDING)), same(ROUNDING))
+        rest = builder.fsub(power, whole)
+        value = same(EXPONENTIAL[-1])
+        for coefficient in EXPONENTIAL[-2::-1]:
+            value = multiply_add(value, rest, same(coefficient))
+        exponent = builder.add(
+            builder.fptosi(whole, bits), ir.Constant(bits, [127] * row.width)
+        )
+        exponent = builder.shl(exponent, ir.Constant(bits, [23] * row.width))
+        return builder.fmul(value, builder.bitcast(exponent, kind))
+
+    return row(row), generate
+
+
 @overload(operator.iadd)
 @overload(operator.add)
 def _overload_add(one, other):
@@ -188,6 +307,13 @@ def _overload_add(one, other):
 def _overload_subtract(one, other):
     if isinstance(one, Lanes) and one == other:
         return lambda one, other: _subtract(one, other)
+    return None
+
+
+@overload(operator.truediv)
+def _overload_divide(one, other):
+    if isinstance(one, Lanes) and one == other:
+        return lambda one, other: _divide(one, other)
     return None
 
 
