@@ -10,12 +10,23 @@ from sharpfield.core.errors import (
     ShapeError,
     SharpfieldError,
 )
-from sharpfield.core.events import EventStream, SiteColour
+from sharpfield.core.events import EventStream, SiteColour, merged
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
+from sharpfield.core.growth import Growth
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.protocols import Field, Formation, Head, Model, Recipe, Renderer, Trajectory
+from sharpfield.core.protocols import (
+    Field,
+    Formation,
+    Growing,
+    Head,
+    Model,
+    PointSet,
+    Recipe,
+    Renderer,
+    Trajectory,
+)
 from sharpfield.core.radiance import Radiance, Samples
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
@@ -34,12 +45,15 @@ __all__ = [
     "Formation",
     "Frames",
     "Group",
+    "Growing",
+    "Growth",
     "Head",
     "MissingExtra",
     "Model",
     "OptionError",
     "Paper",
     "Pixels",
+    "PointSet",
     "Radiance",
     "Rays",
     "Recipe",
@@ -53,4 +67,5 @@ __all__ = [
     "Split",
     "Struct",
     "Trajectory",
+    "merged",
 ]

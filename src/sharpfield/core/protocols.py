@@ -5,11 +5,13 @@ Read this first: a `Trajectory` says where a camera is, a `Field` what a scene e
 and a `Recipe` builds a `Model` from these on one capture.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float, Int64
 from torch import Generator, Tensor
 
+from sharpfield.core.growth import Growth
 from sharpfield.core.measurements import Batch
 from sharpfield.core.paper import Paper
 from sharpfield.core.radiance import Radiance
@@ -154,6 +156,35 @@ class Model(Protocol):
 
     def groups(self) -> list[Group]:
         """Parameters with their learning rates."""
+        ...
+
+
+@runtime_checkable
+class PointSet(Protocol):
+    """A module with parameters, or buffers, that have one row for each of its points.
+
+    Every point set is also an `nn.Module`.
+    """
+
+    def points(self) -> dict[str, Tensor]:
+        """Those parameters and buffers, by their names in the module."""
+        ...
+
+    def replace(self, points: Mapping[str, Tensor]) -> None:
+        """Take others in their place, with another number of rows; parameters stay parameters."""
+        ...
+
+
+@runtime_checkable
+class Growing(Protocol):
+    """A model whose points become more, fewer, or others while it learns."""
+
+    def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
+        """What becomes of point sets after step `step`; depends on the model, step and seed alone.
+
+        The gradients of the step are still there. What else a model does to itself after a step,
+        such as noise on its points, it does here.
+        """
         ...
 
 

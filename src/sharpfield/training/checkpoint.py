@@ -23,13 +23,14 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from sharpfield.core.errors import RunError
 from sharpfield.core.files import replacing
-from sharpfield.core.protocols import Model
+from sharpfield.core.protocols import Model, PointSet
 from sharpfield.training.optim import module_of
+from sharpfield.training.surgery import repoint, resize
 
 Settings = dict[str, Any]
 """What a run was started with, as JSON."""
@@ -151,8 +152,10 @@ def restore(checkpoint: Checkpoint, model: Model, optimizer: Optimizer) -> None:
     Raises:
         RunError: It belongs to another model.
     """
+    built = dict(module_of(model).named_parameters())
     restore_weights(checkpoint, model)
     parameters = dict(module_of(model).named_parameters())
+    repoint(optimizer, {old: parameters[name] for name, old in built.items()})
     optimizer.state.clear()
     for key, tensor in checkpoint.tensors.items():
         kind, _, rest = key.partition(".")
@@ -162,7 +165,7 @@ def restore(checkpoint: Checkpoint, model: Model, optimizer: Optimizer) -> None:
 
 
 def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
-    """Give a model the weights of a checkpoint.
+    """Give a model the weights of a checkpoint, and as many points as it has.
 
     Raises:
         RunError: It belongs to another model.
@@ -174,6 +177,7 @@ def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
         if key.startswith(prefix)
     }
     module = module_of(model)
+    _make_room(saved, module)
     state = module.state_dict()
     wrong = sorted(saved.keys() ^ state.keys()) + [
         f"{name} {list(saved[name].shape)} for {list(tensor.shape)}"
@@ -242,6 +246,17 @@ def _optimizer_tensors(model: Model, optimizer: Optimizer) -> dict[str, Tensor]:
         for name, parameter in module_of(model).named_parameters()
         for moment, tensor in optimizer.state.get(parameter, {}).items()
     }
+
+
+def _make_room(saved: Mapping[str, Tensor], module: nn.Module) -> None:
+    """Give each point set the number of points that was saved."""
+    for path, part in module.named_modules():
+        if isinstance(part, PointSet):
+            place = f"{path}." if path else ""
+            rows = [saved.get(place + name) for name in part.points()]
+            counts = {len(tensor) for tensor in rows if tensor is not None and tensor.ndim}
+            if len(counts) == 1:  # anything else is another model, which the caller notices
+                resize(part, counts.pop())
 
 
 def _like(parameter: Tensor, saved: Tensor, optimizer: Optimizer) -> Tensor:

@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 
 from torch.optim import Optimizer
 
-from sharpfield.core.protocols import Model
+from sharpfield.core.protocols import Growing, Model
 from sharpfield.training.memory import Losses, accumulate
 from sharpfield.training.optim import set_rates
+from sharpfield.training.surgery import rebuild
 
 Hook = Callable[[int, Model, Optimizer, Losses], None]
 """Called with the step just done, the model, the optimizer and the detached loss terms."""
@@ -38,5 +39,7 @@ def fit(
         optimizer.zero_grad(set_to_none=True)
         losses = accumulate(model, model.draw(step), step, parts=parts)
         optimizer.step()
+        for part, growth in model.grow(step) if isinstance(model, Growing) else ():
+            rebuild(part, optimizer, growth)
         for hook in hooks:
             hook(step, model, optimizer, losses)
