@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -193,6 +195,20 @@ def test_a_table_for_fewer_successors_cannot_accumulate_more():
 def test_annealing_changes_the_population():
     table = table_of(stream(), successors=3)
     assert len(with_successors(table, 1)) == len(table_of(stream()))
+
+
+def test_pairs_of_a_rig_stay_with_their_camera():
+    events = stream(600)
+    track = np.random.default_rng(3).integers(0, 3, 600).astype(np.uint16)
+    events = replace(events, track=track, tracks=3)
+    table = table_of(events)
+    drawn = draw_pairs(table, len(table), seed=0, step=0)
+    for camera in range(3):
+        mine = table_of(replace(events.of_track(camera), track=None, tracks=1))
+        alone = draw_pairs(mine, len(mine), seed=0, step=0)
+        names = ("xy", "start", "end", "negative", "positive")
+        part = rows(drawn[drawn.track == camera], *names)
+        assert sorted(part) == sorted(rows(alone, *names))
 
 
 def test_chains_are_consecutive():

@@ -1,4 +1,5 @@
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,16 @@ def test_mapped_and_loaded_events_are_the_same(path, between):
     for name in COLUMNS:
         np.testing.assert_array_equal(getattr(found, name), getattr(loaded, name))
         assert getattr(found, name).dtype == getattr(loaded, name).dtype
+
+
+def test_the_cameras_of_a_rig_are_mapped_too(tmp_path, some_events):
+    events = some_events(4_000)
+    events = replace(events, track=(events.t_us % 3).astype(np.uint16), tracks=3)
+    write_events(tmp_path / "rig.h5", events)
+    found = mapped(tmp_path / "rig.h5")
+    assert isinstance(found.track, np.memmap) and found.tracks == 3
+    np.testing.assert_array_equal(found.track, events.track)
+    assert event_index(found).tracks == 3 and event_index(found).sites == 3 * 120
 
 
 def test_both_ends_are_kept(path):

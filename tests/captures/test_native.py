@@ -112,6 +112,26 @@ def variations(tiny: Capture) -> dict[str, Capture]:
             },
         ),
         "names": replace(tiny, name='ga"rden', source="simulation"),
+        "a rig": replace(
+            tiny,
+            frames=replace(frames, track=np.array([0, 1, 2, 3, 4, 1, 0, 1, 4])),
+            trajectory=Tracks(moving, still(3)),
+            events=replace(events, track=draw.integers(0, 4, 5_000).astype(np.uint16), tracks=4),
+            test_events=replace(events[:70], track=np.full(70, 4, np.uint16), tracks=5),
+        ),
+        "a rig that saw nothing": replace(
+            tiny,
+            trajectory=Still(still(2)),
+            events=replace(events[:0], track=np.zeros(0, np.uint16), tracks=2),
+        ),
+        "geometry": replace(
+            tiny,
+            frames=replace(
+                frames,
+                depth=np.where(draw.random((9, 10, 12)) < 0.5, np.inf, 2.5).astype(np.float32),
+                flow=draw.normal(size=(9, 10, 12, 2)).astype(np.float32),
+            ),
+        ),
     }
 
 
@@ -135,6 +155,9 @@ def variations(tiny: Capture) -> dict[str, Capture]:
         "frames in no part and in both",
         "notes",
         "names",
+        "a rig",
+        "a rig that saw nothing",
+        "geometry",
     ],
 )
 def test_every_kind_of_capture_comes_back_exactly(tiny, tmp_path, kind):
@@ -223,6 +246,23 @@ def test_a_missing_file_is_named(tiny, tmp_path, missing, message):
     with pytest.raises(CaptureError, match=message) as caught:
         native.read(tmp_path)
     assert missing in str(caught.value)
+
+
+def test_a_track_without_poses_is_refused(tiny, tmp_path):
+    native.write(variations(tiny)["a rig"], tmp_path)
+    path = tmp_path / "capture.toml"
+    path.write_text(path.read_text().replace("track = 4", "track = 5"))
+    with pytest.raises(CaptureError, match="of a track that has no poses") as caught:
+        native.read(tmp_path)
+    assert "tracks 0 to 5, 5 with poses" in str(caught.value)
+
+
+def test_geometry_of_another_size_is_refused(tiny, tmp_path):
+    native.write(variations(tiny)["geometry"], tmp_path)
+    np.save(tmp_path / "truth" / "depth.npy", np.zeros((9, 10, 11), np.float32))
+    with pytest.raises(CaptureError, match="depth differs from the frames") as caught:
+        native.read(tmp_path)
+    assert "(9, 10, 11), expected float32 (9, 10, 12)" in str(caught.value)
 
 
 def test_events_of_another_tool_may_need_their_unit(tiny, tmp_path):

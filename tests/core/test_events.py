@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core import CaptureError, EventStream, SiteColour
-from sharpfield.core.events import checked
+from sharpfield.core.events import checked, merged
 
 
 def stream(**change: Any) -> EventStream:
@@ -127,3 +127,43 @@ def test_columns_of_different_lengths_are_refused():
         "  got    x 4, y 4, t 4, p 1\n"
         "  do     the file may be truncated: copy or convert it again"
     )
+
+
+# Several cameras
+
+
+def rig(*tracks: int) -> EventStream:
+    return stream(track=np.array(tracks, np.uint16), tracks=3)
+
+
+def test_the_streams_of_cameras_add_up_to_the_rigs():
+    events = rig(2, 0, 2, 0)
+    parts = [events.of_track(k) for k in range(3)]
+    assert [len(part) for part in parts] == [2, 0, 2]
+    assert parts[2].t_us.tolist() == [10, 20] and parts[2].track.tolist() == [2, 2]
+    again = merged(parts[::-1])
+    for name in ("x", "y", "t_us", "p", "track"):
+        expected = getattr(events, name)[[0, 2, 1, 3]]  # at 20 us track 2 was given first
+        assert getattr(again, name).tolist() == expected.tolist()
+    assert again.tracks == 3
+
+
+def test_a_lone_camera_is_track_0():
+    assert len(stream().of_track(0)) == 4 and len(stream().of_track(1)) == 0
+
+
+def test_windows_keep_the_tracks():
+    assert rig(2, 0, 1, 0).window(20, 40).track.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"tracks": 2}, "must say which one reported"),
+        ({"track": np.array([0, 1, 2, 0], np.uint16), "tracks": 2}, "tracks 0 to 2 .* 2 known"),
+        ({"track": np.array([0, -1, 0, 0], np.int16)}, "belongs to no known track"),
+    ],
+)
+def test_unsound_tracks_are_refused(change: dict, message: str):
+    with pytest.raises(CaptureError, match=message):
+        checked(stream(**change), "rig.h5")

@@ -1,6 +1,8 @@
 """The pixel-major index answers as a slow walk through the time-ordered stream does."""
 
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -227,3 +229,44 @@ def test_time_going_back_at_a_pixel_is_refused() -> None:
     )  # fmt: skip
     with pytest.raises(CaptureError, match="pixel x 2, y 1\n.*an event at 5 us after a later one"):
         ops.build(events)
+
+
+# Several cameras
+
+
+def rig(n: int = 900) -> EventStream:
+    draw = np.random.default_rng(7)
+    return replace(stream(n), track=draw.integers(0, 3, n).astype(np.uint16), tracks=3)
+
+
+def test_each_camera_of_a_rig_has_the_index_of_its_own_stream(tmp_path: Path) -> None:
+    events = rig()
+    for index in (ops.build(events), index_on_disk(events, tmp_path / "index", key="k", held=100)):
+        assert index.sites == 3 * HEIGHT * WIDTH
+        for track in range(3):
+            own = replace(events.of_track(track), track=None, tracks=1)
+            alone, sites = ops.build(own), index.sites_of(track)
+            np.testing.assert_array_equal(index.track_of(sites), track)
+            np.testing.assert_array_equal(index.site_xy[sites], alone.site_xy)
+            begin, end = index.offset[sites[0]], index.offset[sites[-1] + 1]
+            np.testing.assert_array_equal(index.t_us[begin:end], alone.t_us)
+            np.testing.assert_array_equal(index.p[begin:end], alone.p)
+            size = {"width": WIDTH, "height": HEIGHT}
+            np.testing.assert_array_equal(
+                window_image(index, 50, 300, track=track, **size),
+                window_image(alone, 50, 300, **size),
+            )
+
+
+def test_sites_are_numbered_by_track_row_and_column() -> None:
+    index = ops.build(rig())
+    xy = np.array([[3, 2], [6, 4]], np.float32)
+    expected = 2 * HEIGHT * WIDTH + np.array([2 * WIDTH + 3, 4 * WIDTH + 6])
+    np.testing.assert_array_equal(ops.sites_at(index, xy, track=2), expected)
+    np.testing.assert_array_equal(ops.sites_at(index, xy + 0.5, track=2), -1)
+
+
+def test_rectified_rigs_are_refused() -> None:
+    events = stream(9, rectified=True)
+    with pytest.raises(CaptureError, match="must name pixels"):
+        ops.build(replace(events, track=np.zeros(9, np.uint16), tracks=2))

@@ -70,7 +70,6 @@ class PairTable:
     channel: Int8[np.ndarray, "m"] | None
     """Colour filter of each site; None on a mono sensor."""
     clock: Clock
-    track: int = 0
 
     def __len__(self) -> int:
         """Number of events in the population."""
@@ -271,7 +270,7 @@ def _assembled(
     channel = None if table.channel is None else table.channel[site].astype(np.int64)
     return EventPairs(
         xy=torch.from_numpy(table.site_xy[site]),
-        track=torch.full((len(site),), table.track),
+        track=torch.from_numpy(table.index.track_of(site)),
         start=_float(time[0]),
         end=_float(time[1]),
         negative=_float(-darker),

@@ -24,7 +24,8 @@ from sharpfield.ops.event_index_files import file_key, index_on_disk
 IN_MEMORY = 50_000_000
 """Up to this many events (0.7 GB) are loaded, more are mapped."""
 
-COLUMNS = ("x", "y", "t_us", "p")
+COLUMNS = ("x", "y", "t_us", "p", "track")
+"""Of a stream; `track` only where there are several cameras."""
 ABOUT = "events.json"
 """Says what a cache was made from; written last."""
 
@@ -73,7 +74,7 @@ def _filled(
 ) -> EventStream:
     """Events `first` to `last - 1`, in columns that `make` allocates by name and type."""
     stream = file.part(first, first)
-    columns = {name: make(name, getattr(stream, name).dtype) for name in COLUMNS}
+    columns = {name: make(name, getattr(stream, name).dtype) for name in _columns(stream)}
     at = 0
     for chunk in file.chunks(first, last):
         for name, column in columns.items():
@@ -99,8 +100,13 @@ def _mapped(file: EventFile, between: tuple[int, int] | None) -> EventStream:
 
             _filled(file, first, last, make)
             (fresh / ABOUT).write_text(json.dumps(about) + "\n")
-    columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS}
-    return replace(file.part(0, 0), **columns)
+    none = file.part(0, 0)
+    columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in _columns(none)}
+    return replace(none, **columns)
+
+
+def _columns(stream: EventStream) -> list[str]:
+    return [name for name in COLUMNS if getattr(stream, name) is not None]
 
 
 def _about(folder: Path) -> object:

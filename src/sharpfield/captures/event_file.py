@@ -48,6 +48,8 @@ class EventFile:
     site_colour: SiteColour | None = None
     thresholds: tuple[float, float] | None = None
     """Contrast thresholds (natural log) to darker and to brighter, where the file states them."""
+    tracks: int = 1
+    """How many cameras there are; where several, the column `track` tells them apart."""
     resources: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> "EventFile":
@@ -85,6 +87,8 @@ class EventFile:
             height=height,
             bayer=self.bayer,
             site_colour=self.site_colour,
+            track=self.stored("track", first, last) if "track" in self.columns else None,
+            tracks=self.tracks,
         )
 
     def window(self, start_us: int, end_us: int) -> EventStream:

@@ -28,6 +28,8 @@ from sharpfield.core.errors import CaptureError, MissingExtra
 from sharpfield.core.events import SiteColour
 
 COLUMNS = ("x", "y", "t", "p")
+TRACK = "track"
+"""The column that files of several cameras have besides."""
 
 TICKS = {1: "ns", 1000: "us", 1_000_000: "ms"}
 """Units of time by the attribute `tick_ns`."""
@@ -104,7 +106,8 @@ def _open_hdf5(path: Path) -> EventFile:
         grouped = isinstance(group, h5py.Group)
         holder = group if grouped else file
         _expect_columns(holder, path)
-        columns = {name: _column(holder, name, path) for name in COLUMNS}
+        named = [*COLUMNS, *([TRACK] if TRACK in holder else [])]
+        columns = {name: _column(holder, name, path) for name in named}
         tick = _whole(file, "tick_ns", 1000 if grouped else 0)
         unit = TICKS.get(tick)
         size = _whole(file, "width", 0), _whole(file, "height", 0)
@@ -120,6 +123,7 @@ def _open_hdf5(path: Path) -> EventFile:
             bayer=str(file.attrs.get("bayer", "")),
             site_colour=_site_colour(file, path),
             thresholds=_thresholds(file),
+            tracks=_whole(file, "tracks", 1),
             resources=resources.pop_all(),
         )
     raise AssertionError("the block above returns or raises")

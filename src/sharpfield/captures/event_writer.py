@@ -1,10 +1,11 @@
 """Writing events: our superset of the DSEC layout, in as many pieces as you like.
 
     events/{x, y, t, p}     t in us after t_offset, p 0 or 1; chunks of 65 536 events
+    events/track            which camera, where there are several
     ms_to_idx               number of the first event at or after each ms since t_offset
     t_offset                us
     site_colour/{x, y, channel}     only for rectified events of a colour sensor
-    attributes              format, version, tick_ns, width, height, bayer
+    attributes              format, version, tick_ns, width, height, bayer, tracks
 
 Blosc (zstd 1, byte shuffle) packs 20 M real events at 1.7 bytes each and gives a random 10 ms
 window in about 3 ms; without `hdf5plugin` it is gzip 1 with shuffle, which every HDF5 reads.
@@ -35,8 +36,8 @@ SHORT_US = 2**32 - 1
 class EventWriter:
     """Appends events to an open file; made by `writing_events`."""
 
-    def __init__(self, file: h5py.File, path: Path, *, long: bool) -> None:
-        self._file, self._path, self._long = file, path, long
+    def __init__(self, file: h5py.File, path: Path, like: EventStream, *, long: bool) -> None:
+        self._file, self._path, self._like, self._long = file, path, like, long
         self._count = 0
         self._offset_us = 0
         self._last_us: int | None = None
@@ -72,6 +73,8 @@ class EventWriter:
                 got=f"{since[-1] / 6e7:.1f} minutes",
             )
         columns = {"x": events.x, "y": events.y, "t": since, "p": (events.p > 0).astype(np.uint8)}
+        if events.track is not None:
+            columns["track"] = events.track
         for name, values in columns.items():
             self._extend(self._columns[name], values)
         known = len(self._marks)
@@ -85,6 +88,8 @@ class EventWriter:
         if self._last_us is None:
             for name, kind in (("x", "u2"), ("y", "u2"), ("t", "u4"), ("p", "u1")):
                 self._file.create_dataset(f"events/{name}", (0,), kind)
+            if self._like.track is not None:
+                self._file.create_dataset("events/track", (0,), self._like.track.dtype)
         self._file["t_offset"] = np.int64(self._offset_us)
 
     def _begin(self, events: EventStream) -> None:
@@ -96,6 +101,8 @@ class EventWriter:
             "t": np.uint64 if self._long else np.uint32,
             "p": np.uint8,
         }
+        if events.track is not None:
+            kinds["track"] = events.track.dtype
         for name, kind in kinds.items():
             self._columns[name] = self._file.create_dataset(
                 f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_packing()
@@ -129,11 +136,13 @@ def writing_events(
                 width=like.width,
                 height=like.height,
                 bayer=like.bayer,
+                tracks=like.tracks,
             )
             if like.site_colour is not None:
                 for name in ("x", "y", "channel"):
                     file[f"site_colour/{name}"] = getattr(like.site_colour, name)
-            writer = EventWriter(file, path, long=span_us is None or span_us > SHORT_US - 1000)
+            long = span_us is None or span_us > SHORT_US - 1000
+            writer = EventWriter(file, path, like, long=long)
             yield writer
             writer.finish()
 

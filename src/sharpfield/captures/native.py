@@ -4,6 +4,8 @@ capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes:
 frames/NAME.png    8 or 16 bit, grey or RGB
 truth/NAME.png     sharp images at mid-exposure, where known
 events.h5          see `captures.event_writer`
+test_events.h5     likewise, of held-out cameras, if any
+truth/depth.npy, truth/flow.npy     of all frames, where known; see `Frames`
 trajectory.npz     see `captures.native_trajectory`
 points.npy         sparse scene points, if any
 notes.npz          notes that are arrays, if any
@@ -31,11 +33,14 @@ from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
+from sharpfield.core.frames import Frames
+from sharpfield.core.protocols import Trajectory
+from sharpfield.geometry.trajectory import count_tracks
 
 FORMAT, VERSION = "sharpfield-capture", 1
 
 DESCRIPTION = "capture.toml"
-EVENTS = "events.h5"
+EVENTS, TEST_EVENTS = "events.h5", "test_events.h5"
 POINTS = "points.npy"
 NOTES = "notes.npz"
 NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -80,6 +85,8 @@ def write(capture: Capture, folder: Path | str) -> None:
             }
         if capture.events is not None:
             write_events(fresh / EVENTS, capture.events)
+        if capture.test_events is not None:
+            write_events(fresh / TEST_EVENTS, capture.test_events)
         if capture.points is not None:
             np.save(fresh / POINTS, capture.points)
         if arrays:
@@ -108,14 +115,21 @@ def read(folder: Path) -> Capture:
     notes = dict(about.table("notes", optional=True).values)
     if (folder / NOTES).exists():
         notes |= load_arrays(folder / NOTES)
+    trajectory = read_trajectory(about.table("trajectory"), folder, clock)
+    streams = [
+        _read_events(about, folder / file, camera, clock) if (folder / file).exists() else None
+        for file in (EVENTS, TEST_EVENTS)
+    ]
+    _expect_tracks(trajectory, frames, streams, where=folder)
     return Capture(
         camera=camera,
-        trajectory=read_trajectory(about.table("trajectory"), folder, clock),
+        trajectory=trajectory,
         clock=clock,
         near=about.number("near"),
         far=about.number("far"),
         frames=frames,
-        events=_read_events(about, folder, camera, clock) if (folder / EVENTS).exists() else None,
+        events=streams[0],
+        test_events=streams[1],
         split=split,
         points=load_array(folder / POINTS) if (folder / POINTS).exists() else None,
         name=about.text("name", folder.resolve().name),
@@ -124,9 +138,8 @@ def read(folder: Path) -> Capture:
     )
 
 
-def _read_events(about: Table, folder: Path, camera: Camera, clock: Clock) -> EventStream:
+def _read_events(about: Table, path: Path, camera: Camera, clock: Clock) -> EventStream:
     """The events; `[events] unit` is for files made elsewhere, which may not say it."""
-    path = folder / EVENTS
     unit = about.table("events", optional=True).text("unit", "")
     with open_events(path, unit=unit or None) as file:
         sized = file if file.size else replace(file, size=camera.size)
@@ -139,6 +152,26 @@ def _read_events(about: Table, folder: Path, camera: Camera, clock: Clock) -> Ev
                 do=f'give the unit in {DESCRIPTION}: [events] unit = "ns"',
             )
         return read_events(sized)
+
+
+def _expect_tracks(
+    trajectory: Trajectory,
+    frames: Frames | None,
+    streams: list[EventStream | None],
+    *,
+    where: Path,
+) -> None:
+    """Make sure that frames and events are of tracks the trajectory knows."""
+    known = count_tracks(trajectory)
+    named = [] if frames is None else [frames.track]
+    named += [one.track for one in streams if one is not None and one.track is not None]
+    for track in named:
+        if len(track) and not (0 <= track.min() and track.max() < known):
+            raise CaptureError(
+                "a frame or an event is of a track that has no poses",
+                where=where,
+                got=f"tracks {track.min()} to {track.max()}, {known} with poses",
+            )
 
 
 def _camera_table(camera: Camera) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
 "none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
-defaults in brackets.
+defaults in brackets. `truth/depth.npy` and `truth/flow.npy` are of all frames, where known.
 """
 
 import re
@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float32, Shaped
 
+from sharpfield.captures.arrays import load_array
 from sharpfield.captures.images import describe, read_images, write_image
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Split
@@ -21,6 +22,8 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 
 FRAMES, TRUTH = "frames", "truth"
+GEOMETRY = {"depth": (), "flow": (2,)}
+"""Fields of `Frames` that are kept as arrays of one entry per pixel, and their trailing shape."""
 
 USES = {(True, False): "train", (False, True): "test", (True, True): "both", (False, False): "none"}
 """What `use` says of a frame, by whether it is learned from and whether it is held out."""
@@ -60,6 +63,10 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
             if table["truth"]:
                 write_image(folder / TRUTH / file, frames.truth[i])
         tables.append(table)
+    for name in GEOMETRY:
+        if (values := getattr(frames, name)) is not None:
+            (folder / TRUTH).mkdir(exist_ok=True)
+            np.save(folder / TRUTH / f"{name}.npy", values)
     return tables
 
 
@@ -87,6 +94,7 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split]:
         encoding=about.text("encoding"),
         truth=truth,
         truth_known=known,
+        **_read_geometry(folder / TRUTH, images),
     )
     return frames, _split(tables)
 
@@ -107,6 +115,27 @@ def _read_truth(
         )
     truth[known] = found
     return truth, known
+
+
+def _read_geometry(
+    folder: Path, images: Shaped[np.ndarray, "n h w c"]
+) -> dict[str, Float32[np.ndarray, "..."]]:
+    """Depth and flow of all frames, those that are there."""
+    found = {}
+    for name, trailing in GEOMETRY.items():
+        path = folder / f"{name}.npy"
+        if not path.exists():
+            continue
+        values = load_array(path)
+        expected = (*images.shape[:3], *trailing)
+        if values.shape != expected or values.dtype != np.float32:
+            raise CaptureError(
+                f"{name} differs from the frames in size or type",
+                where=path,
+                got=f"{values.dtype} {values.shape}, expected float32 {expected}",
+            )
+        found[name] = values
+    return found
 
 
 def _split(tables: Sequence[Table]) -> Split:

@@ -19,6 +19,7 @@ from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Frames
+from sharpfield.geometry.trajectory import count_tracks
 
 PATH_SAMPLES = 1000
 """Instants at which the length of a trajectory is measured."""
@@ -52,6 +53,8 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
     about: dict[str, Any] = {"kind": "capture", "name": capture.name, "layout": capture.source}
     if capture.events is not None:
         about["events"] = stream_summary(capture.events)
+    if capture.test_events is not None:
+        about["test_events"] = stream_summary(capture.test_events)
     if capture.frames is not None:
         about["frames"] = _frames_summary(capture.frames)
         if capture.notes.get("motion") == "unknown":  # then exposures say nothing about blur
@@ -92,7 +95,16 @@ def stream_summary(events: EventStream) -> dict[str, Any]:
         "height": events.height,
         "rectified": events.rectified,
         "coloured": events.coloured,
+        **_tracks_summary(events),
     }
+
+
+def _tracks_summary(events: EventStream) -> dict[str, Any]:
+    """How many events each camera reported, where there are several."""
+    if events.track is None:
+        return {}
+    each = np.bincount(events.track, minlength=events.tracks)
+    return {"tracks": events.tracks, "count_by_track": each.tolist()}
 
 
 def file_summary(file: EventFile) -> dict[str, Any]:
@@ -170,13 +182,15 @@ def _frames_summary(frames: Frames) -> dict[str, Any]:
         if len(duration)
         else None,
         "with_truth": with_truth,
+        "with_depth": frames.depth is not None,
+        "with_flow": frames.flow is not None,
     }
 
 
 def _trajectory_summary(capture: Capture) -> dict[str, Any]:
     """Tracks, when the first is known, and how long its path is."""
-    track = [0] if capture.frames is None else np.unique(capture.frames.track).tolist()
-    about: dict[str, Any] = {"kind": type(capture.trajectory).__name__, "tracks": len(track)}
+    tracks = count_tracks(capture.trajectory)
+    about: dict[str, Any] = {"kind": type(capture.trajectory).__name__, "tracks": tracks}
     known = capture.trajectory.known_us(0)
     if known is None:
         return about

@@ -62,6 +62,8 @@ class Capture:
     far: float
     frames: Frames | None = None
     events: EventStream | None = None
+    test_events: EventStream | None = None
+    """What event cameras on held-out tracks reported: to be predicted, never learned from."""
     split: Split = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
     points: Float[np.ndarray, "m 3"] | None = None
     """Sparse scene points, where a reconstruction came with the capture."""
@@ -126,6 +128,7 @@ class Capture:
             self,
             frames=None if frames else self.frames,
             events=None if events else self.events,
+            test_events=None if events else self.test_events,
         )
 
     def _frames_agree(self, frames: Frames) -> None:

@@ -1,9 +1,11 @@
-"""What an event camera reports: where and when brightness changed by a threshold, and its sign.
+"""What event cameras report: where and when brightness changed by a threshold, and its sign.
 
-Integer coordinates name a pixel of the sensor (its centre is at +0.5). Float coordinates are
-rectified positions *in the same index units*: 10.0 means the centre of ideal pixel 10.
+Several cameras of one kind, on one clock, share a stream; `track` tells them apart. Integer
+coordinates name a pixel of the sensor (its centre is at +0.5). Float coordinates are rectified
+positions *in the same index units*: 10.0 means the centre of ideal pixel 10.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +16,7 @@ from sharpfield.core.errors import CaptureError
 
 @dataclass(frozen=True)
 class EventStream:
-    """Events of one sensor in the order of time. Arrays may be memory-mapped.
+    """Events of one sensor, or of several alike, in the order of time; may be memory-mapped.
 
     Making one checks nothing, so that slices cost nothing; readers call `checked`.
     """
@@ -31,6 +33,10 @@ class EventStream:
     """Colour filter tile of the raw sensor, e.g. "RGGB" for integer coordinates; "" if mono."""
     site_colour: "SiteColour | None" = None
     """Colour of rectified positions, where coordinates are floats on a colour sensor."""
+    track: Shaped[np.ndarray, "n"] | None = None
+    """Column: the track of the camera that reported, 0 ... tracks-1; None if all are of track 0."""
+    tracks: int = 1
+    """How many tracks there are to tell apart, whether or not their cameras report."""
 
     def __len__(self) -> int:
         """Number of events."""
@@ -53,7 +59,23 @@ class EventStream:
 
     def __getitem__(self, part: slice) -> "EventStream":
         """A slice of the stream, as views."""
-        return replace(self, x=self.x[part], y=self.y[part], t_us=self.t_us[part], p=self.p[part])
+        return self._taken(part)
+
+    def of_track(self, track: int) -> "EventStream":
+        """The events of one camera, copied; they keep their track."""
+        if self.track is None:
+            return self if track == 0 else self[:0]
+        return self._taken(np.flatnonzero(self.track == track))
+
+    def _taken(self, part: slice | Int64[np.ndarray, "k"]) -> "EventStream":
+        return replace(
+            self,
+            x=self.x[part],
+            y=self.y[part],
+            t_us=self.t_us[part],
+            p=self.p[part],
+            track=None if self.track is None else self.track[part],
+        )
 
 
 @dataclass(frozen=True)
@@ -74,10 +96,11 @@ def checked(events: EventStream, where: object) -> EventStream:
 
     Raises:
         CaptureError: Counts differ, times are not ascending, a coordinate is not finite or lies
-            outside the sensor, or a polarity is neither -1 nor +1.
+            outside the sensor, a polarity is neither -1 nor +1, or a track is not one of `tracks`.
     """
-    counts = {len(events.x), len(events.y), len(events.t_us), len(events.p)}
-    if len(counts) != 1:
+    columns = [events.x, events.y, events.t_us, events.p]
+    columns += [] if events.track is None else [events.track]
+    if len({len(column) for column in columns}) != 1:
         raise CaptureError(
             "event columns have different lengths",
             where=where,
@@ -106,7 +129,50 @@ def checked(events: EventStream, where: object) -> EventStream:
             got=events.p[wrong[0]],
             do="map 0 to -1 when reading",
         )
+    _known_tracks(events, where)
     return events
+
+
+def merged(streams: Sequence[EventStream]) -> EventStream:
+    """One stream of several cameras alike, in the order of time; ties keep the order given.
+
+    Args:
+        streams: At least one. Those without a track are of track 0.
+    """
+    track = [
+        np.zeros(len(events), np.uint16) if events.track is None else events.track
+        for events in streams
+    ]
+    t_us = np.concatenate([events.t_us for events in streams])
+    order = np.argsort(t_us, kind="stable")
+    return replace(
+        streams[0],
+        x=np.concatenate([events.x for events in streams])[order],
+        y=np.concatenate([events.y for events in streams])[order],
+        t_us=t_us[order],
+        p=np.concatenate([events.p for events in streams])[order],
+        track=np.concatenate(track)[order],
+        tracks=max(events.tracks for events in streams),
+    )
+
+
+def _known_tracks(events: EventStream, where: object) -> None:
+    if events.tracks > 1 and events.track is None:
+        raise CaptureError(
+            "events of several cameras must say which one reported",
+            where=where,
+            got=f"{events.tracks} tracks and no column of tracks",
+        )
+    if events.track is None:
+        return
+    low, high = int(events.track.min()), int(events.track.max())
+    if events.track.dtype.kind not in "iu" or low < 0 or high >= events.tracks:
+        raise CaptureError(
+            "an event belongs to no known track",
+            where=where,
+            got=f"tracks {low} to {high} of type {events.track.dtype}, {events.tracks} known",
+            do="number the cameras from 0, and say how many there are",
+        )
 
 
 def _inside(

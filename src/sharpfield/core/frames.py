@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64, Shaped, UInt8, UInt16
+from jaxtyping import Float32, Int64, Shaped, UInt8, UInt16
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
@@ -18,7 +18,8 @@ class Frames:
 
     `images` hold what was stored, display-referred unless `encoding` is "linear"; 8 or 16 bit, with
     1 or 3 channels (RGB). `truth`, where known, is the sharp image at the middle of each
-    exposure, in the same encoding; `truth_known` says for which frames.
+    exposure, in the same encoding; `truth_known` says for which frames. `depth` and `flow`, where
+    known, say what the scene was like at that instant.
     """
 
     images: UInt8[np.ndarray, "n h w c"] | UInt16[np.ndarray, "n h w c"]
@@ -28,6 +29,10 @@ class Frames:
     encoding: str = "gamma2.2"
     truth: Shaped[np.ndarray, "n h w c"] | None = None
     truth_known: Shaped[np.ndarray, "n"] | None = None
+    depth: Float32[np.ndarray, "n h w"] | None = None
+    """Along the camera's axis, at pixel centres, in world units; infinite where nothing is."""
+    flow: Float32[np.ndarray, "n h w 2"] | None = None
+    """How fast the point seen at a pixel's centre moves over the image (x, y), in px per second."""
 
     def __post_init__(self) -> None:
         counts = {

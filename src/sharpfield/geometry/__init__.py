@@ -10,6 +10,7 @@ from sharpfield.geometry.trajectory import (
     Still,
     Tracks,
     check_poses,
+    count_tracks,
 )
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "Tracks",
     "cast",
     "check_poses",
+    "count_tracks",
     "ndc",
     "normalisation",
 ]

@@ -46,10 +46,14 @@ def normalised(capture: Capture) -> tuple[Capture, Similarity]:
 
 def moved(capture: Capture, change: Similarity) -> Capture:
     """A capture seen from another world."""
+    frames = capture.frames
+    if frames is not None and frames.depth is not None:
+        frames = dataclasses.replace(frames, depth=frames.depth * np.float32(change.scale))
     return dataclasses.replace(
         capture,
         trajectory=Moved(capture.trajectory, change),
         near=capture.near * change.scale,
         far=capture.far * change.scale,
+        frames=frames,
         points=None if capture.points is None else change.points(capture.points),
     )

@@ -271,3 +271,15 @@ class Moved(nn.Module):
     def known_us(self, track: int) -> tuple[int, int] | None:
         """As the base's."""
         return self.base.known_us(track)
+
+
+def count_tracks(path: Trajectory) -> int:
+    """How many tracks a trajectory has."""
+    match path:
+        case Still():
+            return len(path.poses)
+        case Tracks():
+            return len(path.moving) + len(path.still.poses)
+        case LearnedKnots() | Moved():
+            return count_tracks(path.base)
+    return 1

@@ -34,17 +34,25 @@ def splat_bilinear(
 
 
 def window_image(
-    index: EventIndex, start_us: int, end_us: int, *, width: int, height: int
+    index: EventIndex, start_us: int, end_us: int, *, width: int, height: int, track: int = 0
 ) -> Float64[np.ndarray, "h w 2"]:
     """How many events with start <= t < end got darker and brighter at each pixel.
 
     Rectified positions are shared bilinearly, so that counts need not be whole numbers.
+
+    Args:
+        index: The events.
+        start_us: The first instant that counts.
+        end_us: The first that no longer does.
+        width: Of the picture.
+        height: Of the picture.
+        track: Whose events.
     """
-    site = np.arange(index.sites)
-    start, end = np.full(index.sites, start_us), np.full(index.sites, end_us)
+    site = index.sites_of(track)
+    start, end = np.full(len(site), start_us), np.full(len(site), end_us)
     found = counts(index, *window(index, site, start, end))
     value = np.stack(found, -1).astype(np.float64)
-    return splat_bilinear(index.site_xy, value, width=width, height=height)
+    return splat_bilinear(index.site_xy[site], value, width=width, height=height)
 
 
 @njit(cache=True, nogil=True)

@@ -2,8 +2,9 @@
 
 Vocabulary: a *site* is a place that reports events, see `ops.event_sites`. The index stores the
 events of site 0, then those of site 1, and so on, each in the order of time; `offset` says where a
-site begins. A *position* is a place in that order, so the next event of the same pixel is the next
-position, and "how many events between two times" is two binary searches.
+site begins. Cameras follow each other: site = track * height * width + row * width + column. A
+*position* is a place in that order, so the next event of the same pixel is the next position, and
+"how many events between two times" is two binary searches.
 
 It is built by a counting sort: one pass over the stream counts, one places. All arrays are numpy
 and may be memory-mapped, see `ops.event_index_files`; pictures of it are in `ops.event_image`.
@@ -29,12 +30,14 @@ class EventIndex:
     """Events sorted by site, then by time."""
 
     site_xy: Float32[np.ndarray, "m 2"]
-    """Column and row of each site, ascending by row, then by column. Index units: 10.0 is the
-    centre of pixel 10. With integer coordinates site = row * width + column."""
+    """Column and row of each site, ascending by track, then by row, then by column. Index units:
+    10.0 is the centre of pixel 10."""
     offset: Int64[np.ndarray, "o"]
     """Site s has the positions offset[s] ... offset[s+1] - 1; o = m + 1."""
     t_us: Int64[np.ndarray, "n"]
     p: Int8[np.ndarray, "n"]
+    tracks: int = 1
+    """How many cameras there are; each has the same number of sites."""
 
     def __len__(self) -> int:
         """Number of events."""
@@ -44,6 +47,15 @@ class EventIndex:
     def sites(self) -> int:
         """Number of sites."""
         return len(self.site_xy)
+
+    def track_of(self, site: Int[np.ndarray, "b"]) -> Int64[np.ndarray, "b"]:
+        """The track of the camera that each site belongs to."""
+        return np.asarray(site, np.int64) // max(self.sites // self.tracks, 1)
+
+    def sites_of(self, track: int) -> Int64[np.ndarray, "b"]:
+        """All sites of one camera."""
+        each = self.sites // self.tracks
+        return np.arange(track * each, (track + 1) * each)
 
 
 def build(events: EventStream) -> EventIndex:
@@ -55,7 +67,7 @@ def build(events: EventStream) -> EventIndex:
     site_xy, site_of = find_sites(events)
     offset = count(events, site_of, len(site_xy))
     t_us, p = place(events, site_of, offset, first=0, last=len(site_xy))
-    return EventIndex(site_xy, offset, t_us, p)
+    return EventIndex(site_xy, offset, t_us, p, events.tracks)
 
 
 def count(events: EventStream, site_of: SiteOf, sites: int) -> Int64[np.ndarray, "o"]:
@@ -95,9 +107,14 @@ def place(
     return t_us, p
 
 
-def sites_at(index: EventIndex, xy: Float32[np.ndarray, "b 2"]) -> Int64[np.ndarray, "b"]:
-    """The site at each exact position, or -1 where there is none."""
-    return _sites_at(index.site_xy, xy)
+def sites_at(
+    index: EventIndex, xy: Float32[np.ndarray, "b 2"], *, track: int = 0
+) -> Int64[np.ndarray, "b"]:
+    """The site of one camera at each exact position, or -1 where there is none."""
+    each = index.sites // index.tracks
+    first = track * each
+    found = _sites_at(index.site_xy[first : first + each], xy)
+    return np.where(found < 0, found, found + first)
 
 
 def next_event(

@@ -40,7 +40,7 @@ def index_on_disk(events: EventStream, folder: Path, *, key: str, held: int = HE
     Raises:
         CaptureError: See `build`.
     """
-    found = _open(folder, key)
+    found = _open(folder, key, events.tracks)
     if found is not None:
         return found
     site_xy, site_of = find_sites(events)
@@ -56,7 +56,7 @@ def index_on_disk(events: EventStream, folder: Path, *, key: str, held: int = HE
         t_file.flush()
         p_file.flush()
         (fresh / "index.json").write_text(json.dumps({"format": FORMAT, "key": key}) + "\n")
-    opened = _open(folder, key)
+    opened = _open(folder, key, events.tracks)
     assert opened is not None, f"the index just written to {folder} cannot be read"
     return opened
 
@@ -73,7 +73,7 @@ def site_ranges(offset: Int64[np.ndarray, "o"], held: int) -> list[tuple[int, in
     return ranges
 
 
-def _open(folder: Path, key: str) -> EventIndex | None:
+def _open(folder: Path, key: str, tracks: int) -> EventIndex | None:
     try:
         about = json.loads((folder / "index.json").read_text())
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
@@ -82,7 +82,7 @@ def _open(folder: Path, key: str) -> EventIndex | None:
         return None
     names = ("site_xy", "offset", "t_us", "p")
     arrays = [np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in names]
-    return EventIndex(*(np.asarray(array) for array in arrays))
+    return EventIndex(*(np.asarray(array) for array in arrays), tracks=tracks)
 
 
 def _created(path: Path, dtype: type[np.generic], length: int) -> np.memmap:

@@ -3,7 +3,7 @@
 A *site* is such a place. Sites are numbered by row, then by column. On a sensor with integer
 coordinates every pixel is a site, whether it ever fires or not; rectified positions are collected
 from the stream itself with a hash table of their bits, since a position is only ever compared
-with itself.
+with itself. Cameras of several tracks have their own sites: first all of track 0, then of track 1.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,14 +33,24 @@ def find_sites(events: EventStream) -> tuple[Float32[np.ndarray, "m 2"], SiteOf]
     """All sites of a stream, and the function that names the site of each event.
 
     Returns:
-        site_xy: Column and row of each site, ascending by row, then by column.
+        site_xy: Column and row of each site, ascending by track, then by row, then by column.
         site_of: To be called with parts of the same stream.
+
+    Raises:
+        CaptureError: Positions of several cameras are rectified.
     """
     if events.rectified:
+        if events.tracks > 1:
+            raise CaptureError(
+                "events of several cameras must name pixels, not rectified positions",
+                got=f"{events.tracks} tracks with float coordinates",
+                do="keep the raw coordinates, and give the camera its lens",
+            )
         return _rectified_sites(events)
     width, height = events.width, events.height
     y, x = np.divmod(np.arange(width * height), width)
-    return np.stack([x, y], -1).astype(np.float32), _pixel_site
+    site_xy = np.stack([x, y], -1).astype(np.float32)
+    return np.tile(site_xy, (events.tracks, 1)), _pixel_site
 
 
 def _pixel_site(events: EventStream) -> Int32[np.ndarray, "n"]:
@@ -53,6 +63,8 @@ def _pixel_site(events: EventStream) -> Int32[np.ndarray, "n"]:
             got=f"x {events.x[bad]}, y {events.y[bad]}, sensor {events.width}x{events.height}",
             do="check the sensor size, and whether the file counts pixels from 1",
         )
+    if events.track is not None:
+        site += events.track.astype(np.int32) * np.int32(events.width * events.height)
     return site
 
 
