@@ -117,5 +117,9 @@ def test_colour_noise_and_rolling_rows():
 def test_timing_says_what_is_wrong_with_it():
     with pytest.raises(OptionError, match="overlap\n  got    one of 50000 us every 40000 us"):
         Timing(interval_us=40_000)
-    with pytest.raises(OptionError, match="must be positive\n  got    0"):
+    with pytest.raises(
+        OptionError, match="must be positive, .* not negative\n  got    0, 50000 us"
+    ):
         Timing(frames=0)
+    with pytest.raises(OptionError, match="not negative\n  got    18, -1 us"):
+        Timing(exposure_us=-1)

@@ -110,7 +110,10 @@ def build(
     pages = np.zeros((max(len(sheets), 1), rows, columns), np.float32)
     for pane, sheet in zip(pages, sheets, strict=False):
         pane[: sheet.shape[0], : sheet.shape[1]] = sheet
-    shape = [(p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow) for p in parts]
+    shape = [
+        (p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow, _reach(p))
+        for p in parts
+    ]
     look, which = [], 0
     for part in parts:
         paint, extent = part.paint, (0, 0, 0)
@@ -135,6 +138,11 @@ def linear(colour: str) -> Float64[np.ndarray, "3"]:
     """Linear RGB of a display colour written as #rrggbb (gamma 2.2)."""
     display = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     return np.array(display) ** 2.2
+
+
+def _reach(part: Surface) -> float:
+    """How far a surface goes from its centre."""
+    return float(part.half[0]) if part.kind == BALL else float(np.linalg.norm(part.half))
 
 
 def _axes(turn: Vector) -> Float64[np.ndarray, "3 3"]:

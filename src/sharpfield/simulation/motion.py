@@ -6,6 +6,7 @@ rests, so that every exposure blurs.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,6 +19,15 @@ from sharpfield.geometry import Stamped, se3
 
 STAMP_US = 5000
 """Time between the poses that a capture keeps; a cubic through them is off by less than 1e-4."""
+
+
+@runtime_checkable
+class CameraPath(Protocol):
+    """Where a camera is at any time."""
+
+    def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
+        """World-from-camera, OpenCV axes."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,7 @@ def motion(name: str, seed: int) -> Motion:
     return MOTIONS[name](seed)
 
 
-def stamped(path: Motion, clock: Clock) -> Stamped:
+def stamped(path: CameraPath, clock: Clock) -> Stamped:
     """The poses of a path over a capture, `STAMP_US` apart, as a trajectory."""
     count = -(-clock.span_us // STAMP_US)
     times = clock.origin_us + np.arange(count + 1) * STAMP_US

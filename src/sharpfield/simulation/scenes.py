@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from sharpfield.core.errors import OptionError
+from sharpfield.simulation.bodies import Bodies
 from sharpfield.simulation.building import FLAT, Paint, Surface, ball, box, build, rectangle
 from sharpfield.simulation.surfaces import Surfaces, trace
 from sharpfield.simulation.textures import BRICKS, CHECKS, LEAVES, MARBLE, STRIPES, TILES, WOOD
@@ -26,6 +27,37 @@ class Scene:
     near: float
     """Depth in front of all surfaces, for a camera near the origin."""
     far: float
+    bodies: Bodies | None = None
+    """How surfaces move; None where they stand still or sway."""
+
+    def at(self, time_s: float) -> Surfaces:
+        """The surfaces at a time in seconds; those that sway do so when they are traced."""
+        return self.surfaces if self.bodies is None else self.bodies.at(self.surfaces, time_s)
+
+    def followed(
+        self,
+        points: Float64[np.ndarray, "n 3"],
+        which: Int64[np.ndarray, "n"],
+        time_s: float,
+        later_s: float,
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Where points on surfaces are at another time.
+
+        Args:
+            points: In the world, at `time_s`.
+            which: The surface that each belongs to; -1 for one that stands still.
+            time_s: Seconds.
+            later_s: Seconds; may be earlier.
+        """
+        sway, period = np.split(self.surfaces.sway, [3], axis=1)
+        swung = sway * (_swing(later_s, period) - _swing(time_s, period))
+        moved = points + np.where(which[:, None] >= 0, swung[which], 0.0)
+        if self.bodies is None:
+            return moved
+        now, then = (self.bodies.world_from_body(t)[which] for t in (time_s, later_s))
+        own = np.linalg.solve(now[:, :, :3], (points - now[:, :, 3])[..., None])
+        ridden = (then[:, :, :3] @ own)[..., 0] + then[:, :, 3]
+        return np.where(which[:, None] >= 0, ridden, points)
 
     def light(
         self,
@@ -43,7 +75,11 @@ class Scene:
             time_s: Seconds, for scenes in which something moves.
             footprint_rad: Angle between neighbouring pixels: 1 / focal length in px.
         """
-        return trace(self.surfaces, origin, direction, time_s, footprint_rad)
+        return trace(self.at(time_s), origin, direction, time_s, footprint_rad)
+
+
+def _swing(time_s: float, period: Float64[np.ndarray, "n 1"]) -> Float64[np.ndarray, "n 1"]:
+    return np.sin(2 * np.pi * time_s / period)
 
 
 def scene(name: str) -> Scene:

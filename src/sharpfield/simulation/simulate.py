@@ -20,7 +20,7 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.simulation.blur import FrameSensor
 from sharpfield.simulation.event_sensor import EventSensor
 from sharpfield.simulation.events import watch
-from sharpfield.simulation.motion import Motion, motion, stamped
+from sharpfield.simulation.motion import CameraPath, motion, stamped
 from sharpfield.simulation.recorder import Recorder
 from sharpfield.simulation.scenes import Scene, scene
 
@@ -38,6 +38,7 @@ class Timing:
 
     frames: int = 18
     exposure_us: int = 50_000
+    """0 for sharp frames."""
     interval_us: int = 56_000
     """From one exposure's start to the next."""
     step_us: int = 1000
@@ -49,12 +50,12 @@ class Timing:
     """Every how many frames one is sharp and held out, the first included; 0 for none."""
 
     def __post_init__(self) -> None:
-        if self.frames < 1 or self.exposure_us < 1 or self.step_us < 1:
+        if self.frames < 1 or self.exposure_us < 0 or self.step_us < 1:
             raise OptionError(
-                "frames, exposure and step must be positive",
+                "frames and step must be positive, and exposure not negative",
                 got=f"{self.frames}, {self.exposure_us} us, {self.step_us} us",
             )
-        if self.interval_us < self.exposure_us:
+        if self.interval_us < max(self.exposure_us, 1):
             raise OptionError(
                 "exposures would overlap",
                 got=f"one of {self.exposure_us} us every {self.interval_us} us",
@@ -89,11 +90,13 @@ class Rig:
     """Width and height in px, of both."""
     frame_sensor: FrameSensor = field(default_factory=FrameSensor)
     event_sensor: EventSensor = field(default_factory=EventSensor)
+    focal_of_width: float = FOCAL_OF_WIDTH
+    """Focal length over the image width."""
 
     def camera(self) -> Camera:
         """A pinhole camera with square pixels."""
         width, height = self.size
-        focal = FOCAL_OF_WIDTH * width
+        focal = self.focal_of_width * width
         return Camera(width, height, focal, focal, width / 2, height / 2)
 
 
@@ -102,7 +105,7 @@ STANDARD_RIG, STANDARD_TIMING = Rig(), Timing()
 
 def simulate(
     place: Scene | str = "garden",
-    path: Motion | str = "glide",
+    path: CameraPath | str = "glide",
     *,
     rig: Rig = STANDARD_RIG,
     timing: Timing = STANDARD_TIMING,
@@ -166,7 +169,7 @@ def view(
 
 
 def pictures(
-    place: Scene, path: Motion, camera: Camera, timing: Timing
+    place: Scene, path: CameraPath, camera: Camera, timing: Timing
 ) -> Iterator[tuple[int, Float32[np.ndarray, "h w 3"]]]:
     """Times in us and linear pictures over a whole recording, in the order of time."""
     count = -(-timing.span_us() // timing.step_us)

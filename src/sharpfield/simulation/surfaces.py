@@ -28,16 +28,17 @@ PENUMBRA_RAD = 0.12
 """How wide the sun is."""
 NOTHING = 1e9
 """Depth where a ray meets no surface."""
-CENTRE = 1
-"""Column of `Surfaces.shape` where the centre begins."""
+CENTRE, HALF, AXES, REACH = 1, 4, 7, 17
+"""Columns of `Surfaces.shape` where centre, half extents and axes begin; that of the radius."""
 
 
 class Surfaces(NamedTuple):
     """All surfaces of a scene, as tables of plain numbers, which compiled code passes cheaply."""
 
-    shape: Float64[np.ndarray, "n 17"]
-    """Kind; centre (3); half extents (3; the first is a ball's radius); the surface's own x, y and
-    z axes in the world (9; a rectangle faces -z); 1 if it throws a shadow."""
+    shape: Float64[np.ndarray, "n 18"]
+    """Kind; centre (3); half extents (3; the first is a ball's radius); the linear map from the
+    world to the surface's own axes (9; rows are its x, y and z axes unless it is deformed; a
+    rectangle faces -z); 1 if it throws a shadow; the radius of a ball around it."""
     look: Float64[np.ndarray, "n 16"]
     """Linear RGB of ground, ink and accent (9); texture, cells per unit, seed, slant; page of text
     and its rows and columns."""
@@ -68,26 +69,71 @@ def trace(surfaces, origin, direction, time_s, footprint):
     """
     n = len(direction)
     rgb, depth = np.empty((n, 3), np.float32), np.empty(n, np.float32)
-    shape = surfaces.shape.copy()
-    for i in range(len(shape)):
-        swing = sin(6.283185307179586 * time_s / surfaces.sway[i, 3])
-        shape[i, CENTRE : CENTRE + 3] += surfaces.sway[i, :3] * swing
-    own = 1 if len(origin) > 1 else 0
+    shape = _swayed(surfaces, time_s)
     for r in range(n):
-        o, x, y, z = r * own, direction[r, 0], direction[r, 1], direction[r, 2]
-        length = sqrt(x * x + y * y + z * z)
-        ray = (origin[o, 0], origin[o, 1], origin[o, 2], x / length, y / length, z / length)
-        red, green, blue, far = _gather(surfaces, shape, ray, footprint)
+        ray, length = _unit_ray(origin, direction, r)
+        red, green, blue, far, _ = _gather(surfaces, shape, ray, footprint)
         rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
         depth[r] = far / length
     return rgb, depth
 
 
+@njit(cache=True, fastmath=True, nogil=True)
+@no_type_check
+def meet(surfaces, origin, direction, time_s, footprint):
+    """Which surface each ray meets, the first that covers half of it, and where.
+
+    Args:
+        surfaces: The scene.
+        origin: [n 3] or [1 3] for rays that share it.
+        direction: [n 3], any length.
+        time_s: Seconds, for what sways.
+        footprint: Angle between neighbouring pixels, in rad.
+
+    Returns:
+        Number of the surface [n], -1 where there is none, and depth [n] in lengths of `direction`.
+    """
+    n = len(direction)
+    which, depth = np.empty(n, np.int64), np.empty(n, np.float64)
+    shape = _swayed(surfaces, time_s)
+    for r in range(n):
+        ray, length = _unit_ray(origin, direction, r)
+        _, _, _, far, first = _gather(surfaces, shape, ray, footprint)
+        which[r], depth[r] = first, far / length
+    return which, depth
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _swayed(surfaces, time_s):
+    """The table of shapes with what sways where it is now."""
+    shape = surfaces.shape.copy()
+    for i in range(len(shape)):
+        swing = sin(6.283185307179586 * time_s / surfaces.sway[i, 3])
+        shape[i, CENTRE : CENTRE + 3] += surfaces.sway[i, :3] * swing
+    return shape
+
+
+@njit(cache=True, fastmath=True, inline="always")
+@no_type_check
+def _unit_ray(origin, direction, r):
+    """Position and unit direction of a ray, and how long its direction was."""
+    o = r if len(origin) > 1 else 0
+    x, y, z = direction[r, 0], direction[r, 1], direction[r, 2]
+    length = sqrt(x * x + y * y + z * z)
+    return (origin[o, 0], origin[o, 1], origin[o, 2], x / length, y / length, z / length), length
+
+
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _gather(surfaces, shape, ray, footprint):
-    """Follow one ray through partly covering surfaces; depth is the first that covers half."""
+    """Follow one ray through partly covering surfaces.
+
+    Returns:
+        Red, green, blue; the depth of the first surface that covers half, and its number.
+    """
     red, green, blue, left, depth, start = 0.0, 0.0, 0.0, 1.0, NOTHING, 1e-4
+    first = -1
     for layer in range(LAYERS):
         best, nearest, cover = -1, NOTHING, 0.0
         for i in range(len(shape)):
@@ -103,7 +149,7 @@ def _gather(surfaces, shape, ray, footprint):
         weight = left if layer == LAYERS - 1 else left * cover
         left -= weight
         if depth == NOTHING and left <= 0.5:
-            depth = nearest
+            depth, first = nearest, best
         r, g, b = _colour(surfaces, shape, best, ray, nearest, footprint)
         red, green, blue = red + weight * r, green + weight * g, blue + weight * b
         if left < 1e-3:
@@ -115,6 +161,7 @@ def _gather(surfaces, shape, ray, footprint):
         min(max(green * keep, DARKEST), 1.0),
         min(max(blue * keep, DARKEST), 1.0),
         depth,
+        first,
     )
 
 
@@ -142,7 +189,7 @@ def _meet(shape, i, ray, footprint):
     along = x * ray[3] + y * ray[4] + z * ray[5]
     apart = max(x * x + y * y + z * z - along * along, 0.0)  # squared, from ray to centre
     width = footprint * along
-    if apart > 1.1 * (half[0] ** 2 + half[1] ** 2 + half[2] ** 2) + 16.0 * width * width:
+    if apart > 1.1 * shape[i, REACH] ** 2 + 16.0 * width * width:
         return NOTHING, 0.0
     if shape[i, 0] == BALL:
         if along <= 0.0:
@@ -203,6 +250,8 @@ def _colour(surfaces, shape, i, ray, t, footprint):
         shape[i, 8] * nx + shape[i, 11] * ny + shape[i, 14] * nz,
         shape[i, 9] * nx + shape[i, 12] * ny + shape[i, 15] * nz,
     )
+    size = sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)  # not 1 if it is deformed
+    normal = (normal[0] / size, normal[1] / size, normal[2] / size)
     place = (ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5])
     ambient = surfaces.light[3]
     bright = ambient + (1.0 - ambient) * _sunlight(shape, surfaces.light, i, place, normal)

@@ -1,0 +1,181 @@
+"""Scenes in which something moves, for cameras all around: rigid, articulated, deforming.
+
+The world's z axis points up. All that moves stays within 1.2 of the origin, above a patterned
+table that stands still, before an even grey. Motions take about a second and never rest. As seen
+from 4 away and 30 degrees above, depths are 2 to 6.5.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sharpfield.core.errors import OptionError
+from sharpfield.simulation.bodies import Bodies, Map, Part, after, placed
+from sharpfield.simulation.building import Paint, ball, box, build
+from sharpfield.simulation.scenes import Scene
+from sharpfield.simulation.textures import BRICKS, CHECKS, LEAVES, MARBLE, STRIPES, TILES, WOOD
+
+NEAR, FAR = 2.0, 6.5
+SUN = (-0.4, -0.6, 0.9)
+GREY = ("#565c66", "#565c66")
+TURN = 2 * np.pi
+
+TABLE: list[Part] = [
+    (0, box((0, 0, -1.1), (2.2, 2.2, 0.2), Paint("#efe3cc", "#2d6a8e", "#d98c3f", TILES, 1.6))),
+    (0, ball((-0.85, -0.8, -0.82), 0.18, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 9, 21))),
+    (
+        0,
+        box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)),
+    ),
+]
+"""What stands still in every one of them."""
+
+
+def moving_scene(name: str) -> Scene:
+    """A scene by its name, one of `MOVING_SCENES`.
+
+    Raises:
+        OptionError: There is no such scene.
+    """
+    if name not in MOVING_SCENES:
+        raise OptionError(
+            "unknown moving scene", got=name, do=f"use one of {', '.join(MOVING_SCENES)}"
+        )
+    parts, maps = MOVING_SCENES[name]()
+    surfaces = build([part for _, part in parts], sun=SUN, ambient=0.5, sky=GREY)
+    body = np.array([number for number, _ in parts], np.int64)
+    return Scene(name, surfaces, NEAR, FAR, Bodies(body, maps))
+
+
+Moving = tuple[list[Part], Callable[[float], list[Map]]]
+
+
+def _spinner() -> Moving:
+    """Rigid: a rotor with three painted arms that turns, sways and bobs."""
+    hub = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 4.2)
+    rod = Paint("#9a6b41", "#d9ab78", texture=WOOD, cells=5, seed=4)
+    parts = [
+        *TABLE,
+        (1, box((0, 0, 0), (0.46, 0.46, 0.7), hub)),
+        (1, box((0.45, 0, 0.1), (0.9, 0.12, 0.12), rod)),
+        (1, box((-0.42, 0, -0.15), (0.84, 0.12, 0.12), rod)),
+        (1, box((0, 0.4, 0.2), (0.12, 0.8, 0.12), rod)),
+        (1, ball((0.9, 0, 0.1), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=9))),
+        (
+            1,
+            box(
+                (-0.82, 0, -0.15),
+                (0.3, 0.3, 0.3),
+                Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 8),
+            ),
+        ),
+        (1, ball((0, 0.78, 0.2), 0.17, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 6, 5))),
+    ]
+
+    def maps(t: float) -> list[Map]:
+        sway, bob = 0.22 * np.sin(TURN * 1.1 * t + 0.4), 0.12 * np.sin(TURN * 0.9 * t)
+        yaw = TURN * 0.45 * t + 0.3 * np.sin(TURN * 0.8 * t)
+        return [placed((0, 0, bob - 0.1), yaw=yaw, pitch=sway, roll=0.6 * sway)]
+
+    return parts, maps
+
+
+def _arm() -> Moving:
+    """Articulated: a robot arm of four joints whose gripper opens and closes."""
+    steel = Paint("#d7dde4", "#5b6b7c", "#f2b134", STRIPES, 9, slant=0.5)
+    limb = Paint("#e8743b", "#5c1f12", "#f9e0b8", BRICKS, 7)
+    parts = [
+        *TABLE,
+        (
+            0,
+            box(
+                (0, 0, -0.92),
+                (0.62, 0.62, 0.16),
+                Paint("#efe9dc", "#2f6f6a", texture=CHECKS, cells=8),
+            ),
+        ),
+        (1, box((0, 0, 0.14), (0.46, 0.46, 0.28), steel)),
+        (2, ball((0, 0, 0), 0.22, Paint("#f5f0e6", "#2456a6", texture=CHECKS, cells=9))),
+        (2, box((0, 0, 0.36), (0.28, 0.3, 0.72), limb)),
+        (3, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=10))),
+        (
+            3,
+            box((0, 0, 0.28), (0.23, 0.25, 0.56), Paint("#f3ead8", "#7b1e3a", "#2e7d58", TILES, 6)),
+        ),
+        (4, box((0, 0, 0.07), (0.4, 0.2, 0.12), steel)),
+        (
+            5,
+            box(
+                (0, 0, 0.1),
+                (0.1, 0.18, 0.26),
+                Paint("#f4d06f", "#8f2d56", texture=STRIPES, cells=12),
+            ),
+        ),
+        (
+            6,
+            box(
+                (0, 0, 0.1),
+                (0.1, 0.18, 0.26),
+                Paint("#7fb069", "#24476b", texture=STRIPES, cells=12),
+            ),
+        ),
+    ]
+
+    def maps(t: float) -> list[Map]:
+        turret = placed((0, 0, -0.84), yaw=0.9 * np.sin(TURN * 0.55 * t + 0.3))
+        shoulder = after(turret, placed((0, 0, 0.3), pitch=0.45 + 0.45 * np.sin(TURN * 0.8 * t)))
+        bend = 1.0 + 0.55 * np.sin(TURN * 0.95 * t + 1.0)
+        elbow = after(shoulder, placed((0, 0, 0.76), pitch=-bend))
+        wrist = after(elbow, placed((0, 0, 0.56), yaw=1.2 * np.sin(TURN * 0.7 * t)))
+        gap = 0.14 + 0.05 * np.sin(TURN * 1.6 * t)
+        fingers = [after(wrist, placed((side * gap, 0, 0.12))) for side in (-1, 1)]
+        return [turret, shoulder, elbow, wrist, *fingers]
+
+    return parts, maps
+
+
+LAYERS, LAYER = 6, 0.22
+"""Layers of the jelly tower, and how high each is at rest."""
+
+
+def _jelly() -> Moving:
+    """Deforming: a tower of jelly that bends and swells, and a ball that breathes."""
+    # Two checks per layer, so that the pattern runs on from one layer to the next.
+    paint = Paint("#f08a9b", "#8f1d3f", texture=CHECKS, cells=2 / LAYER)
+    middle = (0, 0, LAYER / 2)
+    parts = [*TABLE]
+    parts += [(k + 1, box(middle, (0.62, 0.62, LAYER), paint)) for k in range(LAYERS)]
+    parts += [
+        (LAYERS + 1, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=8))),
+        (
+            LAYERS + 2,
+            ball((0, 0, 0), 0.2, Paint("#f4d06f", "#24476b", "#ffffff", LEAVES, 9)),
+        ),
+    ]
+
+    def maps(t: float) -> list[Map]:
+        swell = 1 + 0.14 * np.sin(TURN * 0.9 * t)  # sideways; volume is kept
+        height = 1 / swell**2
+        lean = np.array([np.sin(TURN * 0.7 * t), np.sin(TURN * 1.0 * t + 1.3)]) * (0.3, 0.22)
+        # Sideways offset grows with the square of height; a layer is sheared between its two ends.
+        share = (np.arange(LAYERS + 1) / LAYERS) ** 2
+        found = []
+        for k in range(LAYERS):
+            linear = np.diag([swell, swell, height])
+            linear[:2, 2] = lean * (share[k + 1] - share[k]) / LAYER
+            foot = [*(lean * share[k]), -1 + k * LAYER * height]
+            found.append(np.concatenate([linear, np.array(foot)[:, None]], 1))
+        top = placed((*lean, -1 + LAYERS * LAYER * height + 0.16), yaw=2.0 * np.sin(TURN * 0.6 * t))
+        breath = 1 + 0.3 * np.sin(TURN * 1.2 * t)
+        low = np.concatenate([breath * np.eye(3), [[0.72], [-0.55], [-1 + 0.2 * breath]]], 1)
+        return [*found, top, low]
+
+    return parts, maps
+
+
+MOVING_SCENES: dict[str, Callable[[], Moving]] = {
+    "spinner": _spinner,
+    "arm": _arm,
+    "jelly": _jelly,
+}
+"""Scenes by name."""

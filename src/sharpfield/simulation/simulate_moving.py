@@ -1,0 +1,168 @@
+"""One call from a moving scene to a capture of many tracks: every camera of a rig is one.
+
+Tracks that move are numbered first, then those that stand still; within each, cameras to learn
+from come before those held out. Held-out cameras take sharp frames, some of which are the test
+set, and their events are kept apart as `test_events`. Every frame has its sharp truth, depth and
+flow in the middle of its exposure.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.events import EventStream, merged
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import Frames
+from sharpfield.core.protocols import Trajectory
+from sharpfield.core.seed import number
+from sharpfield.geometry import Still, Tracks
+from sharpfield.simulation.cameras import RING_FOCAL, Standing, Views, ring
+from sharpfield.simulation.flow import depth_and_flow
+from sharpfield.simulation.motion import CameraPath, stamped
+from sharpfield.simulation.moving_scenes import moving_scene
+from sharpfield.simulation.recorder import Recorder
+from sharpfield.simulation.scenes import Scene
+from sharpfield.simulation.simulate import Rig, Timing, pictures
+
+MOVING_RIG = Rig(size=(128, 128), focal_of_width=RING_FOCAL)
+MOVING_TIMING = Timing(frames=33, exposure_us=0, interval_us=31_250, step_us=1250, test_every=8)
+"""Sharp frames at both ends of 32 windows of one second; of a held-out camera, every eighth frame
+is for testing."""
+
+RING = ring(8, held_out=4)
+
+
+@dataclass(frozen=True)
+class _Track:
+    """What one camera recorded."""
+
+    frames: Frames
+    events: EventStream
+    notes: dict[str, np.ndarray | float | str]
+
+
+def simulate_moving(
+    place: Scene | str = "arm",
+    views: Views = RING,
+    *,
+    rig: Rig = MOVING_RIG,
+    timing: Timing = MOVING_TIMING,
+    seed: int = 0,
+) -> Capture:
+    """Record a moving scene with a rig of cameras.
+
+    Args:
+        place: A moving scene, or the name of one.
+        views: Where the cameras are.
+        rig: Sensors and their numbers, the same for all cameras.
+        timing: Frames, exposures and sampling; held-out cameras take their frames in the middle
+            of these exposures.
+        seed: Of the sensors' differences and their noise.
+
+    Returns:
+        A capture with everything known. `notes` say the thresholds; where pixels differ, also the
+        thresholds of each pixel of each track.
+    """
+    place = moving_scene(place) if isinstance(place, str) else place
+    clock = Clock(0, timing.span_us())
+    paths = _in_order_of_tracks(views)
+    exposure = replace(timing, test_every=0).exposure()
+    sharp = Exposure(exposure.middle_us, exposure.middle_us)
+    recorded = [
+        _record(place, path, sharp if test else exposure, rig, timing, number(seed, k, "camera"))
+        for k, (path, test) in enumerate(paths)
+    ]
+    held_out = np.array([test for _, test in paths])
+    frames = _joined([track.frames for track in recorded])
+    notes = {k: note for k, note in recorded[0].notes.items() if not isinstance(note, np.ndarray)}
+    if rig.event_sensor.threshold_sigma:
+        maps = ("threshold_on_map", "threshold_off_map")
+        notes |= {name: np.stack([track.notes[name] for track in recorded]) for name in maps}
+    return Capture(
+        camera=rig.camera(),
+        trajectory=_trajectory([path for path, _ in paths], clock),
+        clock=clock,
+        near=place.near,
+        far=place.far,
+        frames=frames,
+        events=_stream(recorded, ~held_out),
+        test_events=_stream(recorded, held_out) if held_out.any() else None,
+        split=_split(frames, held_out, timing),
+        name=place.name,
+        source="simulation",
+        notes=notes,
+    )
+
+
+def _in_order_of_tracks(views: Views) -> list[tuple[CameraPath, bool]]:
+    """Each camera and whether it is held out; those that move first."""
+    every = [(path, False) for path in views.learned] + [(path, True) for path in views.held_out]
+    return sorted(every, key=lambda camera: isinstance(camera[0], Standing))
+
+
+def _record(
+    place: Scene, path: CameraPath, exposure: Exposure, rig: Rig, timing: Timing, seed: int
+) -> _Track:
+    camera = rig.camera()
+    recorder = Recorder(
+        rig.size,
+        exposure,
+        frame_sensor=rig.frame_sensor,
+        event_sensor=rig.event_sensor,
+        seed=seed,
+    )
+    for t_us, rgb in pictures(place, path, camera, timing):
+        recorder.see(rgb, t_us)
+    seen = [depth_and_flow(place, camera, path, int(t)) for t in exposure.middle_us]
+    depth, flow = (np.stack(values) for values in zip(*seen, strict=True))
+    frames = replace(recorder.frames(), depth=depth, flow=flow)
+    return _Track(frames, recorder.events(), recorder.notes())
+
+
+def _joined(tracks: Sequence[Frames]) -> Frames:
+    """The frames of all tracks, track after track."""
+    times = [
+        np.concatenate([getattr(one.exposure, end) for one in tracks])
+        for end in ("open_us", "close_us")
+    ]
+    columns = {
+        name: np.concatenate([getattr(one, name) for one in tracks])
+        for name in ("images", "truth", "truth_known", "depth", "flow")
+    }
+    return replace(
+        tracks[0],
+        exposure=Exposure(*times),
+        track=np.repeat(np.arange(len(tracks)), [len(one) for one in tracks]),
+        names=tuple(f"v{k:02d}_{name}" for k, one in enumerate(tracks) for name in one.names),
+        **columns,
+    )
+
+
+def _stream(tracks: Sequence[_Track], chosen: np.ndarray) -> EventStream:
+    """The events of some tracks, in the order of time."""
+    return merged(
+        [
+            replace(
+                tracks[k].events,
+                track=np.full(len(tracks[k].events), k, np.uint16),
+                tracks=int(np.flatnonzero(chosen)[-1]) + 1,
+            )
+            for k in np.flatnonzero(chosen)
+        ]
+    )
+
+
+def _trajectory(paths: Sequence[CameraPath], clock: Clock) -> Trajectory:
+    still = np.array([path.pose for path in paths if isinstance(path, Standing)])
+    moving = [stamped(path, clock) for path in paths if not isinstance(path, Standing)]
+    return Tracks(moving, still.reshape(-1, 3, 4)) if moving else Still(still)
+
+
+def _split(frames: Frames, held_out: np.ndarray, timing: Timing) -> Split:
+    """All frames to learn from; every so many of the held-out ones, neither first nor last."""
+    test = np.flatnonzero(held_out[frames.track])
+    every = timing.test_every or 1
+    chosen = test % timing.frames % every == every // 2
+    return Split(np.flatnonzero(~held_out[frames.track]), test[chosen])
