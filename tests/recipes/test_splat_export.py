@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 import torch
 
 from sharpfield.captures.splat_file import read_splats
@@ -14,10 +13,9 @@ from tests.fields.test_gaussians import made
 EYE = torch.tensor([[0.3, -0.2, -4.0]])
 
 
-@pytest.mark.parametrize("light", ["display", "linear"])
-def test_what_is_exported_comes_back(tmp_path, light):
+def test_what_is_exported_comes_back(tmp_path):
     scene = made(degree=3)
-    export_splats(scene, tmp_path / "a.ply", light=light)
+    export_splats(scene, tmp_path / "a.ply")
     found = import_splats(tmp_path / "a.ply")
     torch.testing.assert_close(found.rotations, scene.rotations)
     for name in ("means", "log_scales", "opacity_logits", "harmonics"):
@@ -30,13 +28,13 @@ def test_quaternions_are_unit_length_for_viewers_that_do_not_normalise(tmp_path)
     np.testing.assert_allclose(lengths, 1, rtol=1e-6)
 
 
-def test_a_viewer_shows_the_colour_through_the_display_curve(tmp_path):
+def test_a_viewer_shows_linear_light_through_the_display_curve(tmp_path):
     colours = torch.tensor([[0.001, 0.2, 0.9]])
     scene = Gaussians.start(torch.zeros(1, 3), colours, torch.ones(1), degree=1)
     scene.higher_harmonics.data += 1e-3 * torch.randn(1, 3, 3)
-    export_splats(scene, tmp_path / "a.ply", comments=("antialiased",))
+    export_splats(scene, tmp_path / "a.ply", encoding="linear", comments=("antialiased",))
     table = read_splats(tmp_path / "a.ply")
-    assert table.comments == ("colours: display values (sRGB)", "antialiased")
+    assert table.comments == ("antialiased",)
     np.testing.assert_allclose(GREY + FLAT * table.harmonics[:, 0], srgb(colours), atol=1e-6)
     shown = scene.__class__(*(torch.from_numpy(v) for v in list(vars(table).values())[:5]))
     torch.testing.assert_close(shown.colours(EYE), srgb(scene.colours(EYE)), atol=1e-4, rtol=0)
@@ -44,7 +42,7 @@ def test_a_viewer_shows_the_colour_through_the_display_curve(tmp_path):
 
 def test_grey_is_written_as_three_equal_colours(tmp_path):
     scene = made(channels=1)
-    export_splats(scene, tmp_path / "a.ply", light="linear")
+    export_splats(scene, tmp_path / "a.ply")
     found = import_splats(tmp_path / "a.ply")
     torch.testing.assert_close(found.harmonics, scene.harmonics.expand(-1, -1, 3))
 

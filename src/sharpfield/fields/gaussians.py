@@ -3,8 +3,8 @@
 What is learned is free of bounds: quaternions (w x y z) of any length, the natural log of scales,
 the logit of opacities, and real spherical harmonics of the colour. The *base* harmonics are those
 of degree 0, the same from everywhere; the *higher* ones tell how the colour changes with the
-direction, and usually learn more slowly. Colours are linear light:
-0.5 + sum of harmonics, never below zero.
+direction, and usually learn more slowly. A colour is 0.5 + the sum of its harmonics, and never
+below zero; whether it means light or what frames store is up to the renderer.
 
 Source: Kerbl et al., "3D Gaussian splatting for real-time radiance field rendering" (SIGGRAPH
 2023). Its harmonics carry the Condon-Shortley phase and ours do not, see `ops/encoding.py`.
@@ -24,7 +24,7 @@ FLAT = 0.28209479177387814
 """The harmonic of degree 0, the same in all directions."""
 
 GREY = 0.5
-"""Light of a Gaussian whose harmonics are all zero."""
+"""Colour of a Gaussian whose harmonics are all zero."""
 
 
 class Gaussians(nn.Module):
@@ -71,7 +71,7 @@ class Gaussians(nn.Module):
 
         Args:
             points: Where they are.
-            colours: Linear light, not below zero.
+            colours: Not below zero.
             sizes: Standard deviations in world units.
             degree: Of the harmonics they can learn, 0 to 3.
             opacity: Of each, between 0 and 1.
@@ -116,7 +116,7 @@ class Gaussians(nn.Module):
     def colours(
         self, seen_from: Float[Tensor, "v 3"], *, degree: int | None = None
     ) -> Float[Tensor, "v n c"]:
-        """Linear light sent to some places.
+        """What is sent to some places.
 
         Args:
             seen_from: Centres of cameras.

@@ -1,13 +1,12 @@
 """Gaussians to and from the files of splat viewers.
 
-Our Gaussians are linear light; viewers take what a file says as values for the display. Colours
-are therefore written through the sRGB curve: the base exactly, what changes with the direction by
-the slope of the curve there. Viewers then blend display values where we blend light, so soft
-edges come out a little different. A comment in the file says which of the two it holds.
+Viewers take what a file says as values for the display, and blend those. Our Gaussians hold what
+the frames store, which is that already, or nearly; only where the frames are linear are colours
+written through the sRGB curve: the base exactly, what changes with the direction by the slope of
+the curve there. We blend light and viewers do not, so soft edges come out a little different.
 """
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -16,18 +15,10 @@ from torch import Tensor
 
 from sharpfield.captures.splat_file import SplatTable, read_splats, write_splats
 from sharpfield.fields.gaussians import FLAT, GREY, Gaussians
-from sharpfield.formation.tone import srgb, srgb_inverse
+from sharpfield.formation.tone import srgb
 from sharpfield.geometry.se3 import quaternion_from_rotation, rotation_from_quaternion
 from sharpfield.geometry.space import Similarity
 from sharpfield.ops.encoding import spherical_harmonics
-
-Light = Literal["display", "linear"]
-
-SAID: dict[Light, str] = {
-    "display": "colours: display values (sRGB)",
-    "linear": "colours: linear light",
-}
-"""The comment that tells."""
 
 DIRECTIONS = 64
 """Along which harmonics are compared to turn them; 16 would do."""
@@ -37,7 +28,7 @@ def export_splats(
     gaussians: Gaussians,
     path: Path,
     *,
-    light: Light = "display",
+    encoding: str = "srgb",
     change: Similarity | None = None,
     comments: tuple[str, ...] = (),
 ) -> None:
@@ -46,13 +37,13 @@ def export_splats(
     Args:
         gaussians: Of one or three colours.
         path: Ends in .ply.
-        light: What the file is to hold.
+        encoding: Of what the Gaussians hold, see `Frames`.
         change: To another world, e.g. the capture's own; by default none.
         comments: What else to write into the header.
     """
     seen = gaussians if change is None else moved(gaussians, change)
     harmonics = seen.harmonics.detach().cpu()
-    if light == "display":
+    if encoding == "linear":
         harmonics = _displayed(harmonics)
     table = SplatTable(
         means=_array(seen.means),
@@ -60,27 +51,24 @@ def export_splats(
         log_scales=_array(seen.log_scales),
         opacity_logits=_array(seen.opacity_logits),
         harmonics=_array(harmonics.expand(-1, -1, 3)),
-        comments=(SAID[light], *comments),
+        comments=comments,
     )
     write_splats(path, table)
 
 
 def import_splats(path: Path) -> Gaussians:
-    """Read Gaussians; colours are taken for display values unless a comment says otherwise.
+    """Read Gaussians; their colours are values for the display.
 
     Raises:
         CaptureError: The file is missing or truncated, or does not hold Gaussians.
     """
     table = read_splats(path)
-    harmonics = torch.from_numpy(table.harmonics)
-    if SAID["linear"] not in table.comments:
-        harmonics = _lit(harmonics)
     return Gaussians(
         torch.from_numpy(table.means),
         torch.from_numpy(table.quaternions),
         torch.from_numpy(table.log_scales),
         torch.from_numpy(table.opacity_logits),
-        harmonics,
+        torch.from_numpy(table.harmonics),
     )
 
 
@@ -114,21 +102,12 @@ def _turned(
 
 
 def _displayed(harmonics: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
-    light = GREY + FLAT * harmonics[:, :1]
-    base = (srgb(light) - GREY) / FLAT
-    return torch.cat([base, harmonics[:, 1:] * _slope(light)], 1)
-
-
-def _lit(harmonics: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
-    light = srgb_inverse(GREY + FLAT * harmonics[:, :1])
-    return torch.cat([(light - GREY) / FLAT, harmonics[:, 1:] / _slope(light)], 1)
-
-
-def _slope(light: Float[Tensor, "n 1 c"]) -> Float[Tensor, "n 1 c"]:
-    """Of the sRGB curve."""
-    light = light.detach().requires_grad_()
+    """Harmonics of linear light through the sRGB curve."""
+    light = (GREY + FLAT * harmonics[:, :1]).detach().requires_grad_()
     with torch.enable_grad():
-        return torch.autograd.grad(srgb(light).sum(), light)[0]
+        shown = srgb(light)
+        slope = torch.autograd.grad(shown.sum(), light)[0]
+    return torch.cat([(shown.detach() - GREY) / FLAT, slope * harmonics[:, 1:]], 1)
 
 
 def _array(values: Tensor) -> Float[np.ndarray, "..."]:

@@ -1,0 +1,86 @@
+"""Sharp pictures of a scene, and where each was taken from: what a sparse cloud is made from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture
+from sharpfield.formation.edi import latent_in_light
+from sharpfield.formation.event_motion import EventMotion
+from sharpfield.formation.threshold import FixedThresholds
+from sharpfield.formation.tone import tone_of
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Pictures of one camera and their poses."""
+
+    camera: Camera
+    values: Float[np.ndarray, "n h w c"]
+    """As frames store them, 0...1."""
+    poses: Float[np.ndarray, "n 3 4"]
+    """World-from-camera."""
+    near: float
+    far: float
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.values)
+
+    def directions(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m 3"]:
+        """Unit directions, in the world, seen by pixels of a picture."""
+        ray = self.camera.direction(torch.from_numpy(xy.astype(np.float64))).numpy()
+        return ray @ self.poses[view, :, :3].T
+
+    def project(
+        self, points: Float[np.ndarray, "m 3"], view: int
+    ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+        """Pixels of points in a picture, and their depth along its axis.
+
+        Points less than half as far as the nearest depth get the depth -1 and no pixel.
+        """
+        pose = self.poses[view]
+        seen = (points.astype(np.float64) - pose[:, 3]) @ pose[:, :3]
+        depth = seen[:, 2]
+        ahead = depth > 0.5 * self.near
+        xy = np.full((len(points), 2), -1.0)
+        xy[ahead] = self.camera.project(torch.from_numpy(seen[ahead])).numpy()
+        return xy, np.where(ahead, depth, -1.0)
+
+    def inside(self, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, "m"]:
+        """Which positions are on the picture."""
+        x, y = xy.T
+        return (x >= 0) & (x < self.camera.width) & (y >= 0) & (y < self.camera.height)
+
+    def look(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m c"]:
+        """Values of the pixels of a picture that hold some positions."""
+        x, y = np.minimum(xy.astype(np.int64), np.array(self.camera.size) - 1).T
+        return self.values[view, y, x]
+
+
+def sharp_pictures(capture: Capture, thresholds: FixedThresholds) -> Pictures:
+    """The frames to learn from: deblurred to the middle of their exposure where events tell how.
+
+    Args:
+        capture: With frames, in the space that the pictures are to have.
+        thresholds: Of the events, if there are any.
+
+    Raises:
+        CaptureError: There are no frames, or events and frames differ in size.
+    """
+    frames, chosen = capture.needed_frames, capture.split.train
+    tone = tone_of(frames.encoding)
+    motion = None if capture.events is None else EventMotion.of(capture)
+    values = []
+    for i in chosen:
+        picture = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
+        if motion is not None and not frames.exposure.instant[i]:
+            middle = frames.exposure.middle_us[i : i + 1]
+            path = motion.path(frames.exposure.window(int(i)), middle, thresholds)
+            picture = latent_in_light(picture, path, 0, tone)
+        values.append(picture.numpy())
+    poses = capture.frame_pose(chosen).detach().double().numpy()
+    return Pictures(capture.camera, np.stack(values), poses, capture.near, capture.far)
