@@ -1,8 +1,10 @@
 import numpy as np
+import pytest
 
 from sharpfield.core.capture import Capture
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.recipes.pictures import Pictures, sharp_pictures
+from sharpfield.simulation import Rig, Timing, simulate
 
 THRESHOLDS = FixedThresholds(0.2, 0.2)
 """Of the simulation."""
@@ -14,11 +16,19 @@ def off(pictures: Pictures, capture: Capture) -> float:
     return float(np.sqrt(((pictures.values - truth) ** 2).mean()))
 
 
-def test_events_make_them_sharp(tiny):
-    sharp = sharp_pictures(tiny, THRESHOLDS)
-    blurred = sharp_pictures(tiny.without(events=True), THRESHOLDS)
-    assert off(sharp, tiny) < 0.8 * off(blurred, tiny)
-    assert len(sharp) == len(tiny.split.train) and sharp.values.dtype == np.float32
+@pytest.fixture(scope="module")
+def shaken() -> Capture:
+    """Exposures so long that the frames are visibly blurred."""
+    timing = Timing(frames=3, exposure_us=150_000, interval_us=160_000, test_every=3)
+    return simulate("tiles", rig=Rig(size=(64, 48)), timing=timing, seed=3)
+
+
+def test_events_make_them_sharp(shaken):
+    sharp = sharp_pictures(shaken, THRESHOLDS)
+    blurred = sharp_pictures(shaken.without(events=True), THRESHOLDS)
+    assert off(blurred, shaken) > 0.04
+    assert off(sharp, shaken) < 0.6 * off(blurred, shaken)
+    assert len(sharp) == 2 and sharp.values.dtype == np.float32
 
 
 def test_without_events_they_are_the_frames(tiny):
@@ -39,8 +49,8 @@ def test_projecting_undoes_looking_along_rays(tiny):
     ray = found.directions(xy, 1)
     points = found.poses[1, :, 3] + (depth / (ray @ found.poses[1, :, 2]))[:, None] * ray
     there, seen = found.project(points, 1)
-    np.testing.assert_allclose(there, xy, atol=1e-9)
-    np.testing.assert_allclose(seen, depth)
+    np.testing.assert_allclose(there, xy, atol=1e-4)
+    np.testing.assert_allclose(seen, depth, rtol=1e-5)
     _, behind = found.project(2 * found.poses[1, :, 3] - points, 1)
     assert (behind == -1).all()
 
