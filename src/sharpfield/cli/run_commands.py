@@ -21,7 +21,7 @@ from sharpfield.metrics.lpips import load_lpips
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.saved import Started
-from sharpfield.rendering.view import render_view
+from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.training import Options
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -142,7 +142,7 @@ def render(
     def rendered(number: int) -> np.ndarray:
         pose = torch.from_numpy(camera_moves.poses[number]).to(where)
         time = float(camera_moves.time[number])
-        seen = render_view(model.render, model.capture.camera, pose, time)
+        seen = render_view(renderer_of(model), model.capture.camera, pose, time)
         return eight_bit(model.develop(seen.rgb))
 
     numbers = track(

@@ -1,4 +1,4 @@
-"""What one training step looks at: pixels of frames and pairs of events, as tensors."""
+"""What one training step looks at: pixels, pairs of events, and instants, as tensors."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -58,5 +58,22 @@ class EventPairs(Struct):
         return self.negative * threshold_negative + self.positive * threshold_positive
 
 
-Batch = dict[str, Pixels | EventPairs]
+@dataclass(frozen=True)
+class Instants(Struct):
+    """When whole images are looked at: the k instants of each look lie along the last axis."""
+
+    trailing: ClassVar = {"corner": 1}
+
+    time: Float[Tensor, "*b"]
+    """0...1 of the capture, ascending."""
+    track: Int64[Tensor, "*b"]
+    weight: Float[Tensor, "*b"]
+    """Of each instant in the exposure of the look; 0 for those outside."""
+    corner: Int64[Tensor, "*b 2"]
+    """Pixel (x, y) at the upper left of the part of the image that is looked at."""
+    size: tuple[int, int]
+    """Width and height of the part."""
+
+
+Batch = dict[str, Pixels | EventPairs | Instants]
 """What a recipe draws for a step, by name."""

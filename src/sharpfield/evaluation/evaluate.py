@@ -32,7 +32,7 @@ from sharpfield.evaluation.reference import Reference, held_out, trained_on
 from sharpfield.evaluation.scores import NAMES, mean, score
 from sharpfield.metrics import Lpips, laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX
-from sharpfield.rendering.view import CHUNK, Progress, render_view
+from sharpfield.rendering.view import CHUNK, Progress, render_view, renderer_of
 
 METRICS = "metrics.json"
 
@@ -149,7 +149,7 @@ def _render(
         pose = own.trajectory.pose(torch.tensor(time, device=home), track).detach()
     begun = perf_counter()
     seen = render_view(
-        model.render,
+        renderer_of(model),
         own.camera,
         pose.to(device_of(model)),
         time,

@@ -32,7 +32,8 @@ from sharpfield.evaluation.device import device_of
 from sharpfield.evaluation.reference import held_out
 from sharpfield.geometry import cast, se3
 from sharpfield.metrics import align, psnr
-from sharpfield.rendering.view import CHUNK, render_view
+from sharpfield.rendering.splat import whole
+from sharpfield.rendering.view import CHUNK, ViewRenderer, render_view, renderer_of
 
 Pose = Float[Tensor, "3 4"]
 
@@ -234,10 +235,15 @@ def _error(
     """Mean squared error of fine and coarse renders, display domain."""
     camera = model.capture.camera
     row, column = (torch.from_numpy(part).to(twist.device) for part in divmod(pixels, camera.width))
-    pose = se3.compose(view.start, se3.exp(twist)).expand(len(pixels), 3, 4)
-    xy = torch.stack([column, row], -1) + 0.5
-    ones = torch.ones_like(xy[:, 0])
-    seen = model.render(cast(camera, pose, xy, view.time * ones, ones))
+    pose = se3.compose(view.start, se3.exp(twist))
+    if isinstance(model, ViewRenderer):
+        seen = model.draw_views(whole(camera, pose, view.time))[0, row, column, 0]
+    else:
+        xy = torch.stack([column, row], -1) + 0.5
+        ones = torch.ones_like(xy[:, 0])
+        seen = model.render(
+            cast(camera, pose.expand(len(pixels), 3, 4), xy, view.time * ones, ones)
+        )
     stored = view.image[row, column]
     error = (model.develop(seen.rgb) - stored).square().mean()
     if seen.coarse is not None:
@@ -262,9 +268,8 @@ def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) ->
     found = []
     for view, twist in zip(views, twists.detach().clone(), strict=True):
         pose = se3.compose(view.start, se3.exp(twist))
-        light = render_view(model.render, model.capture.camera, pose, view.time).rgb.to(
-            twist.device
-        )
+        light = render_view(renderer_of(model), model.capture.camera, pose, view.time)
+        light = light.rgb.to(twist.device)
         picture = model.develop(light).clamp(0, 1)
         error = (picture - view.image).square().mean(-1).reshape(-1)
         found.append(_Seen(twist, float(psnr(picture, view.image)), error))

@@ -1,6 +1,7 @@
 """Pure functions of poses and space."""
 
 from sharpfield.geometry.cast import cast
+from sharpfield.geometry.shake import LearnedShake
 from sharpfield.geometry.space import Frustum, Metric, Similarity, Space, ndc, normalisation
 from sharpfield.geometry.trajectory import (
     BSpline,
@@ -17,6 +18,7 @@ __all__ = [
     "BSpline",
     "Frustum",
     "LearnedKnots",
+    "LearnedShake",
     "Metric",
     "Moved",
     "Similarity",

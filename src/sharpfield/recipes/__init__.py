@@ -9,8 +9,17 @@ from typing import Any
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, Splat
 
-RECIPES: dict[str, Any] = {"nerf": NeRF, "ev-deblur-nerf": EvDeblurNeRF}
+RECIPES: dict[str, Any] = {
+    "nerf": NeRF,
+    "ev-deblur-nerf": EvDeblurNeRF,
+    "splat": Splat,
+    "edi-splat": EdiSplat,
+    "blur-splat": BlurSplat,
+    "event-splat": EventSplat,
+    "ev-splat": EvSplat,
+}
 """By the name that the command line knows."""
 
 
@@ -32,4 +41,15 @@ def recipe_named(name: str) -> Any:
     return known[name]
 
 
-__all__ = ["RECIPES", "EvDeblurNeRF", "NeRF", "all_recipes", "recipe_named"]
+__all__ = [
+    "RECIPES",
+    "BlurSplat",
+    "EdiSplat",
+    "EvDeblurNeRF",
+    "EvSplat",
+    "EventSplat",
+    "NeRF",
+    "Splat",
+    "all_recipes",
+    "recipe_named",
+]

@@ -1,0 +1,220 @@
+"""The model of all splat recipes: Gaussians, the looks of each step, and the unknowns.
+
+A step looks at whole images, or at a part of one, in one of two ways. *Early*, where events can
+make sharp pictures, it looks at one instant, drawn from the whole capture, and compares one view
+with the picture that events carry there: cheap, and from everywhere. *Late* it looks at one
+exposure: views at several instants of it whose mean is the blurred frame, and one instant beside
+it, with the events counted between each two that follow each other.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.growth import Growth
+from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
+from sharpfield.core.protocols import PointSet
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, exponential
+from sharpfield.core.views import Views
+from sharpfield.formation.mix import mix
+from sharpfield.formation.tone import tone_of
+from sharpfield.geometry.normalise import normalised
+from sharpfield.recipes.looks import LookOptions, Looks
+from sharpfield.recipes.splat_scene import GaussianOptions, SplatScene
+from sharpfield.recipes.splat_start import starting_gaussians
+from sharpfield.recipes.unknowns import (
+    UnknownOptions,
+    Unknowns,
+    pose_groups,
+    with_learned_poses,
+    with_learned_shake,
+)
+
+Terms = dict[str, Tensor]
+
+
+@runtime_checkable
+class SplatNumbers(Protocol):
+    """The numbers of a splat recipe."""
+
+    @property
+    def steps(self) -> int:
+        """Length of the schedule."""
+        ...
+
+    @property
+    def gaussians(self) -> GaussianOptions:
+        """What the scene is made of."""
+        ...
+
+    @property
+    def looks(self) -> LookOptions:
+        """What steps look at."""
+        ...
+
+    @property
+    def unknowns(self) -> UnknownOptions:
+        """What else is learned."""
+        ...
+
+
+class SplatModel(nn.Module):
+    """A splat recipe on one capture. Frames, events, or both: what is missing is left out.
+
+    Args:
+        recipe: With `gaussians`, `looks`, `unknowns` and `steps`.
+        capture: As read.
+        seed: Of the run.
+    """
+
+    def __init__(self, recipe: SplatNumbers, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.recipe, self.seed = recipe, seed
+        self.options = recipe.looks
+        self.capture, self.change = normalised(_checked(capture))
+        if _motion_unknown(capture) and self.options.blur == "motion":
+            self.capture = with_learned_shake(self.capture, seed)
+        else:
+            self.capture = with_learned_poses(self.capture, recipe.unknowns)
+        self.path = self.capture.trajectory
+        self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
+        self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
+        self.looks = Looks(self.options, self.capture, self.unknowns.guess, seed)
+        self.scene = SplatScene(
+            recipe.gaussians,
+            self.capture,
+            starting_gaussians(
+                recipe.gaussians, self.capture, self.unknowns.guess, self.tone, seed
+            ),
+            self.tone,
+            steps=recipe.steps,
+            seed=seed,
+        )
+        early = self.options.early if self.looks.sharp is not None else 0.0
+        self.late_from = int(early * recipe.steps)
+
+    @property
+    def heaviest_step(self) -> int:
+        """The first late step."""
+        return min(self.late_from, max(self.recipe.steps - 1, 0))
+
+    def draw(self, step: int) -> Batch:
+        """One instant in early steps; in late ones an exposure, or a stretch of events."""
+        late_us = round(self.unknowns.offset_us)
+        if step < self.late_from:
+            batch = self.looks.instant(step, late_us)
+        elif self.capture.frames is None:
+            batch = self.looks.stretch(step)
+        elif self.unknowns.offset_steps is None or self.looks.motion is None:
+            batch = self.looks.exposure(step, events=True)
+        # Views of the frames' instants cannot tell when events really happened.
+        elif step % 2:
+            batch = self.looks.stretch(step)
+        else:
+            batch = self.looks.exposure(step, events=False, late_us=late_us)
+        device = self.scene.gaussians.means.device
+        return {name: seen.to(device) for name, seen in batch.items()}
+
+    def losses(self, batch: Batch, step: int) -> Terms:
+        """Errors of sharp pictures, of the blurred one, and of the events between instants."""
+        assert isinstance(look := batch["look"], Instants)
+        frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
+        only_events = events is not None and frames is None
+        time = self.unknowns.on_time(look.time) if only_events else look.time
+        pose = self.path.pose(time, look.track)
+        light = self.scene.draw(Views(pose, time, look.weight, look.corner, look.size))
+        terms = self.scene.idleness()
+        if isinstance(frames, Pixels):
+            exposed = replace(light, rgb=self._exposed(light.rgb, frames))
+            terms["blur"] = (mix(exposed, outer=self.tone.encode) - frames.value).abs().mean()
+        if isinstance(sharp, Pixels):
+            weight = 1.0 if step < self.late_from else self.options.sharp
+            stored = self.tone.encode(self._exposed(light.rgb, sharp[..., 0]))
+            terms["sharp"] = weight * (stored - sharp.value).abs().mean()
+        if isinstance(events, EventPairs):
+            terms["events"] = self.options.windows * self._event_error(light, events)
+        if (prior := self.unknowns.prior()) is not None:
+            terms["prior"] = prior
+        return terms
+
+    def _exposed(self, light: Float[Tensor, "m h w k c"], seen: Pixels) -> Tensor:
+        if self.unknowns.log_gain is None:
+            return light
+        gain = self.unknowns.log_gain[seen.frame[:, 0, 0]].exp()
+        return light * gain[:, None, None, None, None]
+
+    def _event_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
+        """Of all windows of one look after the other."""
+        return torch.stack(
+            [self._look_error(light[i], events[i]) for i in range(len(events))]
+        ).mean()
+
+    def _look_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
+        """Squared error of the change of log light; silent pixels may change by a threshold."""
+        first, pairs = events[0].reshape(-1), events.reshape(-1)
+        colours = events.shape[-1]  # 1, or 3 behind a colour filter
+        rgb = light.rgb.flatten(0, 1).repeat_interleave(colours, 0)  # [h w c, k, rgb]
+        log = self.unknowns.response(rgb, first)[..., 0]
+        change = (log[:, 1:] - log[:, :-1]).T.reshape(-1)
+        negative, positive = self.unknowns.thresholds(pairs)
+        error = (change - pairs.measured(negative, positive)).square()
+        silent = (pairs.negative == 0) & (pairs.positive == 0)
+        beyond = torch.relu(change - positive) + torch.relu(-change - negative)
+        return torch.where(silent, beyond.square(), error).mean()
+
+    def draw_views(self, views: Views) -> Radiance:
+        """Sharp linear light of whole views."""
+        return self.scene.draw(views)
+
+    def render(self, rays: Rays) -> Radiance:
+        """Not possible: Gaussians are drawn as whole views.
+
+        Raises:
+            OptionError: Always.
+        """
+        raise OptionError(
+            "a scene of Gaussians draws whole views, not scattered rays",
+            got=f"{rays.weight.numel()} rays",
+            do="call draw_views",
+        )
+
+    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """As the frames store it."""
+        return self.tone.encode(light).clamp(0, 1)
+
+    def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
+        """What becomes of the Gaussians after a step."""
+        return self.scene.grow(step)
+
+    def groups(self) -> list[Group]:
+        """Gaussians, unknowns and poses."""
+        rate, steps = self.recipe.unknowns.poses_rate, max(self.recipe.steps, 1)
+        falling = exponential(rate, rate / 10, until=steps)
+        return [
+            *self.scene.groups(),
+            *self.unknowns.groups(),
+            *pose_groups(self.capture, falling),
+        ]
+
+
+def _motion_unknown(capture: Capture) -> bool:
+    return capture.notes.get("motion") == "unknown" and capture.frames is not None
+
+
+def _checked(capture: Capture) -> Capture:
+    if capture.camera.lens != "pinhole":
+        raise OptionError(
+            "splats are drawn for lenses without distortion",
+            where=capture.name,
+            got=f"a {capture.camera.lens} lens",
+            do="undistort frames and events first, or use a recipe that renders rays",
+        )
+    return capture

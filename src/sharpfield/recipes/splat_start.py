@@ -1,0 +1,75 @@
+"""The Gaussians that a splat recipe starts from."""
+
+import numpy as np
+import torch
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.seed import generator
+from sharpfield.fields import Gaussians
+from sharpfield.formation.threshold import FixedThresholds
+from sharpfield.formation.tone import Tone
+from sharpfield.recipes.pictures import Pictures, sharp_pictures
+from sharpfield.recipes.splat_scene import GaussianOptions, budget_of
+from sharpfield.recipes.start_points import starting_points
+
+GREY = 0.2
+"""Linear light that a scene without frames starts from."""
+
+PATH_VIEWS = 16
+"""Places along the trajectory from which a scene without frames is filled."""
+
+
+def starting_gaussians(
+    options: GaussianOptions,
+    capture: Capture,
+    thresholds: tuple[float, float],
+    tone: Tone,
+    seed: int,
+) -> Gaussians:
+    """Small round Gaussians near the surfaces, as well as can be told.
+
+    Args:
+        options: How many and how large.
+        capture: In its normalised space.
+        thresholds: Of the events, to darker and to brighter.
+        tone: Gaussians hold stored values.
+        seed: Of the run.
+    """
+    made = generator(seed, 0, "start")
+    if capture.frames is None:
+        pictures = _grey(capture)
+    else:
+        pictures = sharp_pictures(capture, FixedThresholds(*thresholds))
+    start = starting_points(
+        pictures,
+        max(int(options.start * budget_of(options, capture)), 1),
+        made,
+        known=_known(capture),
+        size=options.size,
+    )
+    return Gaussians.start(
+        torch.from_numpy(start.points),
+        tone.encode(torch.from_numpy(start.colours)),
+        torch.from_numpy(start.sizes),
+        degree=options.degree,
+        opacity=options.opacity,
+    )
+
+
+def _known(capture: Capture) -> np.ndarray | None:
+    points = capture.points
+    if capture.frames is None:
+        return np.zeros((0, 3)) if points is None else points
+    return points
+
+
+def _grey(capture: Capture) -> Pictures:
+    """What a scene looks like that only events have seen."""
+    width, height = capture.camera.size
+    time = torch.linspace(0, 1, PATH_VIEWS)
+    poses = capture.trajectory.pose(time, torch.zeros(PATH_VIEWS, dtype=torch.int64))
+    channels = 3 if capture.needed_events.coloured else 1
+    light = np.full((PATH_VIEWS, height, width, channels), GREY, np.float32)
+    return Pictures(
+        capture.camera, light, poses.detach().double().numpy(), capture.near, capture.far
+    )

@@ -1,0 +1,171 @@
+"""What real cameras do not tell: thresholds, exposure gains, poses, a time offset.
+
+Each is fixed at what the capture says, or learned from there together with the scene.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.schedule import Group, Schedule, constant
+from sharpfield.core.seed import generator
+from sharpfield.formation.response import FixedResponse, LogResidual, Response
+from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
+from sharpfield.geometry import LearnedKnots, LearnedShake
+from sharpfield.recipes.event_term import thresholds_of
+
+VIRTUAL_SHUTTER = 0.5
+"""Part of the time between photos of unknown motion for which their shutters are taken as open;
+the length does not matter, as only places within the exposure are asked for."""
+
+SHAKE_KNOTS = 4
+FIRST_SHAKE = 1e-3
+"""Size of the first random twists, in rad and units of the normalised scene."""
+
+
+@dataclass(frozen=True)
+class UnknownOptions:
+    """What is learned besides the scene, and how fast."""
+
+    threshold: tuple[float, float] | None = None
+    """Contrast threshold to darker and to brighter to start from; None takes what the capture
+    notes, or 0.2."""
+    thresholds: Literal["fixed", "signs", "pixels"] = "fixed"
+    """Learn a factor for each sign, or for each sign and pixel."""
+    response: Literal["fixed", "residual"] = "fixed"
+    """Events follow log light, or log light plus a learned residual that starts at zero."""
+    gains: bool = False
+    """Learn how bright each frame was exposed."""
+    knots: int = 0
+    """Knots of a learned correction of the trajectory, at least 4; 0 believes the poses."""
+    offset: bool = False
+    """Learn by how much the events' clock is late against the frames' and poses'."""
+    rate: float = 2e-3
+    """Learning rate of thresholds, response and gains (all logarithms)."""
+    poses_rate: float = 3e-4
+    """Of twists, in rad and units of the normalised scene."""
+    offset_rate_us: float = 20.0
+    """Of the offset, in us a step."""
+
+
+class Unknowns(nn.Module):
+    """The unknowns of one capture.
+
+    Args:
+        options: Which are learned.
+        capture: In its normalised space.
+        seed: Of the run.
+    """
+
+    def __init__(self, options: UnknownOptions, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.options, self.clock = options, capture.clock
+        self.guess = thresholds_of(capture, options.threshold)
+        if options.thresholds == "fixed":
+            self.thresholds = FixedThresholds(*self.guess)
+        else:
+            pixels = capture.camera.size if options.thresholds == "pixels" else None
+            self.thresholds = LearnedThresholds(*self.guess, pixels=pixels)
+        self.response: Response = FixedResponse(floor=FLOOR)
+        if options.response == "residual":
+            made = generator(seed, 0, "response")
+            self.response = LogResidual(inputs="light", floor=FLOOR, generator=made)
+        frames = 0 if capture.frames is None else len(capture.frames)
+        self.log_gain = nn.Parameter(torch.zeros(frames)) if options.gains and frames else None
+        self.offset_steps = nn.Parameter(torch.zeros(())) if options.offset else None
+
+    @property
+    def offset_us(self) -> float:
+        """By how much the events' clock is late."""
+        if self.offset_steps is None:
+            return 0.0
+        return float(self.offset_steps.detach()) * OFFSET_UNIT_US
+
+    def on_time(self, time: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """When what events report really happened, both 0...1 of the capture."""
+        if self.offset_steps is None:
+            return time
+        return time - self.offset_steps * (OFFSET_UNIT_US / self.clock.span_us)
+
+    def exposed(
+        self, light: Float[Tensor, "m h w c"], frame: Int64[Tensor, "m"]
+    ) -> Float[Tensor, "m h w c"]:
+        """The light as a frame of that gain records it."""
+        if self.log_gain is None:
+            return light
+        return light * self.log_gain[frame].exp()[:, None, None, None]
+
+    def prior(self) -> Float[Tensor, ""] | None:
+        """What keeps the learned near its start; None if nothing needs it."""
+        terms = []
+        if isinstance(self.thresholds, LearnedThresholds) and self.thresholds.log_pixel is not None:
+            terms.append(self.thresholds.prior())
+        if self.log_gain is not None:
+            terms.append(self.log_gain.mean().square() * GAIN_PRIOR)
+        return torch.stack(terms).sum() if terms else None
+
+    def groups(self) -> list[Group]:
+        """Parameters with their rates."""
+        options = self.options
+        offset = [] if self.offset_steps is None else [self.offset_steps]
+        others = [p for p in self.parameters() if all(p is not one for one in offset)]
+        found = [("unknowns", others, constant(options.rate))]
+        found.append(("offset", offset, constant(options.offset_rate_us / OFFSET_UNIT_US)))
+        return [Group(name, tuple(own), rate) for name, own, rate in found if own]
+
+
+OFFSET_UNIT_US = 1000.0
+FLOOR = 1e-4
+"""Linear light added before the logarithm of what events see."""
+
+GAIN_PRIOR = 1.0
+"""Weight of the mean log gain, which the scene's own brightness could take up."""
+
+
+def with_learned_poses(capture: Capture, options: UnknownOptions) -> Capture:
+    """The capture with a correction of its trajectory to learn, if one is asked for."""
+    if options.knots == 0:
+        return capture
+    tracks = 1 if capture.frames is None else int(capture.frames.track.max()) + 1
+    path = LearnedKnots(capture.trajectory, knots=options.knots, tracks=tracks)
+    return replace(capture, trajectory=path)
+
+
+def with_learned_shake(capture: Capture, seed: int) -> Capture:
+    """Photos of unknown motion as exposures whose motion is to be learned."""
+    frames = capture.needed_frames
+    middle = frames.exposure.middle_us
+    gap = int(np.diff(np.sort(middle)).min()) if len(middle) > 1 else capture.clock.span_us
+    half = max(int(gap * VIRTUAL_SHUTTER / 2), 1)
+    exposure = Exposure(middle - half, middle + half)
+    opens, closes = (
+        torch.from_numpy(capture.clock.unit(t)).float()
+        for t in (exposure.open_us, exposure.close_us)
+    )
+    start = torch.zeros(len(frames), SHAKE_KNOTS, 6)
+    made = generator(seed, 0, "shake")
+    learned = torch.from_numpy(capture.split.train)
+    start[learned] = FIRST_SHAKE * torch.randn(len(learned), SHAKE_KNOTS, 6, generator=made)
+    by_track = torch.from_numpy(frames.track)
+    path = LearnedShake(
+        capture.trajectory,
+        opens[by_track.argsort()],
+        closes[by_track.argsort()],
+        knots=SHAKE_KNOTS,
+        start=start[by_track.argsort()],
+    )
+    return replace(capture, trajectory=path, frames=replace(frames, exposure=exposure))
+
+
+def pose_groups(capture: Capture, rate: Schedule) -> list[Group]:
+    """What of the trajectory is learned."""
+    path = capture.trajectory
+    learned = path.parameters() if isinstance(path, LearnedKnots | LearnedShake) else ()
+    own = tuple(p for p in learned if p.requires_grad)
+    return [Group("poses", own, rate)] if own else []

@@ -1,0 +1,100 @@
+"""Gaussians drawn as whole views.
+
+What Gaussians send are *stored* values, as frames hold them and the files of splat viewers expect;
+a tone curve turns them into linear light before they are blended, because light is what adds up.
+Depth is the distance along the optical axis, in world units.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.views import Views
+from sharpfield.ops.rasterize import Canvas, rasterize
+
+
+@runtime_checkable
+class Cloud(Protocol):
+    """Gaussians, as `fields.Gaussians` holds them."""
+
+    means: Tensor
+    quaternions: Tensor
+
+    @property
+    def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations."""
+        ...
+
+    @property
+    def opacities(self) -> Float[Tensor, "n"]:
+        """0...1."""
+        ...
+
+    def colours(self, seen_from: Float[Tensor, "v 3"]) -> Float[Tensor, "v n c"]:
+        """Stored values sent to some places, not below zero."""
+        ...
+
+
+@dataclass(frozen=True)
+class Splatting:
+    """How a cloud of Gaussians is drawn."""
+
+    camera: Camera
+    decode: Callable[[Tensor], Tensor]
+    """Stored values to linear light."""
+    background: float = 0.0
+    """Light from behind everything, 0 black to 1 white."""
+    antialiased: bool = True
+
+    def __call__(
+        self, cloud: Cloud, views: Views, shift: Float[Tensor, "v n 2"] | None = None
+    ) -> Radiance:
+        """Linear light of whole views.
+
+        Args:
+            cloud: What is drawn.
+            views: `[m, k]`: the k views that explain each of m measurements.
+            shift: Moves splats in pixels, see `ops.rasterize`; v = m k.
+
+        Returns:
+            Radiance `[m, h, w, k]`.
+        """
+        m, k = views.shape
+        poses = views.pose.reshape(-1, 3, 4)
+        canvas = Canvas(
+            self.camera, views.corner.reshape(-1, 2), views.size, antialiased=self.antialiased
+        )
+        drawn = rasterize(
+            cloud.means,
+            cloud.quaternions,
+            cloud.scales,
+            cloud.opacities,
+            self.decode(cloud.colours(poses[:, :, 3])),
+            poses,
+            canvas,
+            shift,
+        )
+        light, opacity = drawn.light, drawn.opacity
+        if self.background:
+            light = light + self.background * (1 - opacity[..., None])
+        depth = drawn.depth / opacity.clamp_min(1e-6)
+        weight = views.weight[:, None, None].expand(m, *opacity.shape[1:], k)
+
+        def apart(values: Tensor) -> Tensor:
+            """`[m k, ...]` to `[m, ..., k]`, or with channels last to `[m, h, w, k, c]`."""
+            return values.unflatten(0, (m, k)).movedim(1, 3)
+
+        return Radiance(apart(light), apart(depth), apart(opacity), weight)
+
+
+def whole(camera: Camera, pose: Float[Tensor, "3 4"], time: float) -> Views:
+    """The full image of a camera, as the only view of its measurement: `[1, 1]`."""
+    one = pose.new_ones(1, 1)
+    corner = torch.zeros(1, 1, 2, dtype=torch.int64)
+    return Views(pose[None, None], time * one, one, corner, camera.size)
