@@ -7,6 +7,7 @@ import pytest
 
 from sharpfield.captures import nerfstudio
 from sharpfield.captures.images import write_image
+from sharpfield.captures.ply import Ply, write_ply
 from sharpfield.core.errors import CaptureError
 
 INTRINSICS = {"fl_x": 10.0, "fl_y": 11.0, "cx": 4.5, "cy": 3.5, "w": 8, "h": 6}
@@ -90,9 +91,22 @@ def test_parallel_cameras_look_at_no_point():
     assert nerfstudio.guessed_bounds(poses[:1]) == pytest.approx((1.0, 100.0))
 
 
-def test_points_that_were_not_read_are_noted(tmp_path):
+def test_points(tmp_path):
     written(tmp_path, ply_file_path="sparse_pc.ply")
-    assert nerfstudio.read(tmp_path).notes["points"] == "sparse_pc.ply was not read"
+    rows = np.array([(1, 2, 3, 9), (4, 5, 6, 9)], [*((k, "f4") for k in "xyz"), ("red", "u1")])
+    write_ply(tmp_path / "sparse_pc.ply", Ply(rows))
+    np.testing.assert_array_equal(nerfstudio.read(tmp_path).points, [[1, 2, 3], [4, 5, 6]])
+    write_ply(tmp_path / "sparse_pc.ply", Ply(rows[:0]))
+    assert nerfstudio.read(tmp_path).points is None
+
+
+def test_points_that_are_named_must_be_there(tmp_path):
+    written(tmp_path, ply_file_path="sparse_pc.ply")
+    with pytest.raises(CaptureError, match="file not found\n  where  .*sparse_pc.ply"):
+        nerfstudio.read(tmp_path)
+    written(tmp_path, ply_file_path=7)
+    with pytest.raises(CaptureError, match="`ply_file_path` must be text"):
+        nerfstudio.read(tmp_path)
 
 
 def test_intrinsics_of_frames_may_be_given_one_by_one(tmp_path):

@@ -30,14 +30,14 @@ def test_most_start_near_a_wall(started):
 
 
 def test_guessing_alone_is_worse(held, started):
-    blank = replace(held, values=np.full_like(held.values, 0.5))
+    blank = replace(held, light=np.full_like(held.light, 0.5))
     points = starting_points(blank, 2000, chance()).points
     assert (np.abs(points[:, 2] - depth_at(points)) < 0.3).mean() < 0.5
     assert (points[:, 2] > 1.8).all() and (points[:, 2] < 9).all()  # near 2 and far 8
 
 
 def test_guessed_depths_are_even_in_their_inverse(held):
-    blank = replace(held, values=held.values[:1] * 0, poses=np.eye(3, 4)[None])
+    blank = replace(held, light=held.light[:1] * 0, poses=np.eye(3, 4)[None])
     inverse = 1 / starting_points(blank, 4000, chance()).points[:, 2]
     counts, _ = np.histogram(inverse, bins=5, range=(1 / 8, 1 / 2))
     assert counts.sum() == 4000 and counts.min() > 720 and counts.max() < 880
@@ -82,6 +82,11 @@ def test_a_cloud_larger_than_the_budget_is_thinned(held):
     known = np.stack([np.linspace(-0.5, 0, 50), np.zeros(50), np.full(50, 3.0)], -1)
     points = starting_points(held, 20, chance(), known=known).points
     assert len(np.unique(points, axis=0)) == 20 and (points[:, 2] == 3).all()
+
+
+def test_a_known_cloud_of_nothing_means_guessing(held):
+    points = starting_points(held, 300, chance(), known=np.zeros((0, 3))).points
+    assert (np.abs(points[:, 2] - depth_at(points)) < 0.3).mean() < 0.5
 
 
 def test_it_depends_on_its_generator_alone(held, started):

@@ -84,8 +84,8 @@ def test_two_pictures_are_enough():
 
 def test_without_anything_in_common_there_are_no_points():
     held = pictures()
-    blank = replace(held, values=np.full_like(held.values, 0.5))
-    for few in (blank, replace(held, values=held.values[:1], poses=held.poses[:1])):
+    blank = replace(held, light=np.full_like(held.light, 0.5))
+    for few in (blank, replace(held, light=held.light[:1], poses=held.poses[:1])):
         cloud = triangulate(few)
         assert cloud.points.shape == (0, 3) and cloud.colours.shape == (0, 3)
         assert cloud.seen.shape == (len(few), 0)

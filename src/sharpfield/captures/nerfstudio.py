@@ -4,6 +4,7 @@
     camera_model k1 k2 k3 k4 p1 p2    OPENCV, OPENCV_FISHEYE or PINHOLE, and its distortion
     frames                            file_path, transform_matrix
     train_filenames, test_filenames, val_filenames     optional
+    ply_file_path                     optional: sparse scene points
 
 Source: nerfstudio's documentation of its data format, and instant-ngp, where it comes from.
 """
@@ -24,6 +25,7 @@ from sharpfield.captures.photos import (
     photo_capture,
     same_camera,
 )
+from sharpfield.captures.ply import columns, read_ply
 from sharpfield.captures.transforms import (
     frame_name,
     frames_of,
@@ -81,8 +83,6 @@ def read(
     names = [frame_name(frame["file_path"]) for frame in frames]
     poses = poses_of(frames, path)
     notes = {} if bounds else {"bounds": "guessed from where the cameras look"}
-    if "ply_file_path" in content:
-        notes["points"] = f"{content['ply_file_path']} was not read"
     photos = Photos(
         images=read_images(paths),
         poses=poses,
@@ -96,6 +96,7 @@ def read(
         bounds=bounds or guessed_bounds(poses),
         name=folder.resolve().name,
         source="nerfstudio",
+        points=_points(folder, content, path),
         notes=notes,
     )
 
@@ -113,6 +114,17 @@ def guessed_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
     else:
         depth = 10 * (float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0)
     return NEAR * depth, FAR * depth
+
+
+def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.ndarray, "m 3"] | None:
+    named = content.get("ply_file_path")
+    if named is None:
+        return None
+    if not isinstance(named, str):
+        raise CaptureError("`ply_file_path` must be text", where=path, got=named)
+    place = folder / named
+    points = columns(read_ply(place), ("x", "y", "z"), where=place).astype(np.float64)
+    return points if len(points) else None
 
 
 def _camera(content: dict[str, Any], path: Path) -> Camera:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
+from sharpfield.formation.tone import GAMMA
 from sharpfield.recipes.pictures import Pictures
 
 MOST_FEATURES = 4000
@@ -55,14 +56,14 @@ class Features:
 
 
 def find_features(pictures: Pictures) -> list[Features]:
-    """Features of each picture."""
+    """Features of each picture, as a display shows it: light alone hides the dark parts."""
     sift = cv2.SIFT_create(  # pyright: ignore
         MOST_FEATURES, contrastThreshold=FAINTEST, enable_precise_upscale=True
     )
     found = []
-    for values in pictures.values:
-        grey = np.rint(255 * values.mean(-1)).astype(np.uint8)
-        points, about = sift.detectAndCompute(grey, None)
+    for light in pictures.light:
+        shown = np.rint(255 * light.mean(-1) ** (1 / GAMMA)).astype(np.uint8)
+        points, about = sift.detectAndCompute(shown, None)
         xy = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
         about = np.zeros((0, 128), np.float32) if about is None else about
         _, first = np.unique(xy, axis=0, return_index=True)  # one per place, not per orientation

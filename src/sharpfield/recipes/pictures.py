@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
-from sharpfield.formation.edi import latent_in_light
+from sharpfield.formation.edi import latent
 from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
@@ -19,8 +19,8 @@ class Pictures:
     """Pictures of one camera and their poses."""
 
     camera: Camera
-    values: Float[np.ndarray, "n h w c"]
-    """As frames store them, 0...1."""
+    light: Float[np.ndarray, "n h w c"]
+    """Linear, 0...1."""
     poses: Float[np.ndarray, "n 3 4"]
     """World-from-camera."""
     near: float
@@ -28,7 +28,7 @@ class Pictures:
 
     def __len__(self) -> int:
         """How many there are."""
-        return len(self.values)
+        return len(self.light)
 
     def directions(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m 3"]:
         """Unit directions, in the world, seen by pixels of a picture."""
@@ -56,9 +56,9 @@ class Pictures:
         return (x >= 0) & (x < self.camera.width) & (y >= 0) & (y < self.camera.height)
 
     def look(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m c"]:
-        """Values of the pixels of a picture that hold some positions."""
+        """Light of the pixels of a picture that hold some positions."""
         x, y = np.minimum(xy.astype(np.int64), np.array(self.camera.size) - 1).T
-        return self.values[view, y, x]
+        return self.light[view, y, x]
 
 
 def sharp_pictures(capture: Capture, thresholds: FixedThresholds) -> Pictures:
@@ -74,13 +74,14 @@ def sharp_pictures(capture: Capture, thresholds: FixedThresholds) -> Pictures:
     frames, chosen = capture.needed_frames, capture.split.train
     tone = tone_of(frames.encoding)
     motion = None if capture.events is None else EventMotion.of(capture)
-    values = []
+    light = []
     for i in chosen:
-        picture = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
+        stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
+        picture = tone.decode(stored)
         if motion is not None and not frames.exposure.instant[i]:
             middle = frames.exposure.middle_us[i : i + 1]
             path = motion.path(frames.exposure.window(int(i)), middle, thresholds)
-            picture = latent_in_light(picture, path, 0, tone)
-        values.append(picture.numpy())
+            picture = latent(picture, path, 0)
+        light.append(picture.clamp(0, 1).numpy())
     poses = capture.frame_pose(chosen).detach().double().numpy()
-    return Pictures(capture.camera, np.stack(values), poses, capture.near, capture.far)
+    return Pictures(capture.camera, np.stack(light), poses, capture.near, capture.far)

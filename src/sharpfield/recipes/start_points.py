@@ -31,7 +31,7 @@ class StartPoints:
 
     points: Float32[np.ndarray, "n 3"]
     colours: Float32[np.ndarray, "n c"]
-    """As the pictures have them."""
+    """Linear light."""
     sizes: Float32[np.ndarray, "n"]
     """In world units, so that all together fill a picture."""
 
@@ -79,7 +79,7 @@ def starting_points(
 def _shown(pictures: Pictures, points: Float[np.ndarray, "m 3"]) -> Cloud:
     """Known points that some picture shows; where one hides another is not known."""
     seen = np.zeros((len(pictures), len(points)), bool)
-    shown = np.full((*seen.shape, pictures.values.shape[-1]), np.nan)
+    shown = np.full((*seen.shape, pictures.light.shape[-1]), np.nan)
     for view in range(len(pictures)):
         xy, depth = pictures.project(points, view)
         seen[view] = pictures.inside(xy) & (depth > 0)
@@ -100,7 +100,7 @@ def _drawn(
     nearest, farthest = 1 / pictures.near, 1 / pictures.far
     inverse = farthest + (nearest - farthest) * chance[:, 3]
     points = np.zeros((count, 3))
-    colours = np.zeros((count, pictures.values.shape[-1]))
+    colours = np.zeros((count, pictures.light.shape[-1]))
     for view in range(len(pictures)):
         here = np.flatnonzero(views == view)
         colours[here] = pictures.look(xy[here], view)

@@ -32,7 +32,7 @@ class Cloud:
 
     points: Float[np.ndarray, "m 3"]
     colours: Float[np.ndarray, "m c"]
-    """Mean of what the pictures show."""
+    """Linear light: the mean of what the pictures show."""
     seen: Bool[np.ndarray, "n m"]
     """Which picture shows which point."""
     error_px: Float[np.ndarray, "m"]
@@ -74,7 +74,7 @@ def triangulate(pictures: Pictures) -> Cloud:
     )
     sightings = np.maximum(np.bincount(seen.track, minlength=count), 1)
     error = np.sqrt(np.bincount(seen.track, off**2, minlength=count) / sightings)
-    colours = np.zeros((count, pictures.values.shape[-1]))
+    colours = np.zeros((count, pictures.light.shape[-1]))
     for view in range(len(pictures)):
         here = seen[seen.view == view]
         np.add.at(colours, here.track, pictures.look(here.xy, view))
