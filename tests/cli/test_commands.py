@@ -52,6 +52,44 @@ def test_inspect_keeps_its_contract(recorded: Path, capsys: pytest.CaptureFixtur
     assert alone["events"]["count"] == found["events"]["count"]
 
 
+@pytest.mark.parametrize(("rig", "kind"), [("ring", "Still"), ("hand", "Tracks")])
+def test_simulate_puts_cameras_around_what_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], rig: str, kind: str
+) -> None:
+    out = tmp_path / "arm"
+    words = ("--scene", "arm", "--rig", rig, "--views", 3, "--held-out", 2, "--size", "16x16")
+    timing = ("--frames", 3, "--interval-us", 20_000, "--step-us", 5_000)
+    assert run("simulate", "--out", out, *words, *timing) == 0
+    assert "events are in" in capsys.readouterr().out
+    assert run("inspect", out, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    cameras = 3 if rig == "ring" else 1
+    assert found["trajectory"]["kind"] == kind and found["trajectory"]["tracks"] == cameras + 2
+    assert len(found["events"]["count_by_track"]) == cameras
+    assert found["test_events"]["count"] > 0 and found["frames"]["with_flow"]
+    assert found["frames"]["count"] == 3 * (cameras + 2) and found["frames"]["blurry"] == 0
+
+
+def test_simulate_writes_evdnerfs_layout(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "arm"
+    words = ("--scene", "jelly", "--views", 2, "--size", "16x16", "--frames", 3)
+    timing = ("--interval-us", 500_000, "--step-us", 50_000, "--layout", "evdnerf")
+    assert run("simulate", "--out", out, *words, *timing) == 0
+    capsys.readouterr()
+    assert run("inspect", out, "--json", "--trust-pickle") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["layout"] == "evdnerf" and found["frames"]["count"] == 12
+
+
+def test_only_layouts_with_pickled_files_can_be_trusted(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("inspect", recorded, "--trust-pickle") == 2
+    assert "the layout native has no option trust_pickle" in capsys.readouterr().err
+
+
 def test_simulate_writes_the_published_layout(tmp_path: Path, recorded: Path) -> None:
     out = tmp_path / "published"
     words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)

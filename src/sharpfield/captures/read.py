@@ -6,11 +6,15 @@ from pathlib import Path
 
 from sharpfield.captures import (
     colmap,
+    d_nerf,
     deblur_nerf,
+    evdnerf,
+    event_nerf,
     llff_events,
     native,
     nerf_synthetic,
     nerfstudio,
+    robust_e_nerf,
 )
 from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.hold_out import split_by_rule
@@ -24,7 +28,7 @@ class Layout:
     """A way to lay a capture out on disk."""
 
     recognise: Callable[[Path], bool]
-    """Whether a folder has this layout, judged by the names of its files."""
+    """Whether a folder has this layout, judged by its files without loading them."""
     read: Callable[..., Capture]
     """Takes the folder, and the options below."""
     marks: str
@@ -42,6 +46,29 @@ LAYOUTS: dict[str, Layout] = {
         options=("event_unit",),
     ),
     "deblur-nerf": Layout(deblur_nerf.recognise, deblur_nerf.read, "poses_bounds.npy and images*/"),
+    "evdnerf": Layout(
+        evdnerf.recognise,
+        evdnerf.read,
+        "transforms_train.json and data_frames_train.npy",
+        options=("trust_pickle", "threshold"),
+    ),
+    "event-nerf": Layout(
+        event_nerf.recognise,
+        event_nerf.read,
+        "train/pose/, train/intrinsics/ and train/events/*.npz",
+        options=("event_unit",),
+    ),
+    "robust-e-nerf": Layout(
+        robust_e_nerf.recognise,
+        robust_e_nerf.read,
+        "raw_events.npz, camera_poses.npz and camera_calibration.npz",
+    ),
+    "d-nerf": Layout(
+        d_nerf.recognise,
+        d_nerf.read,
+        "transforms_train.json with a `time` in each frame",
+        options=("missing",),
+    ),
     "nerf-synthetic": Layout(
         nerf_synthetic.recognise,
         nerf_synthetic.read,
@@ -90,6 +117,7 @@ def read(
     encoding: str | None = None,
     hold_out: str | None = None,
     threshold: float | None = None,
+    trust_pickle: bool = False,
 ) -> Capture:
     """Read a capture.
 
@@ -101,6 +129,8 @@ def read(
         encoding: How stored values relate to light (see `Frames`), where the layout is wrong.
         hold_out: Frames to hold out: `every:8`, `last:5` or `none`; by default as the layout says.
         threshold: Contrast threshold of the events for both signs, where it is known better.
+        trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
+            are built from them, and anything else is refused.
 
     Raises:
         CaptureError: The capture cannot be read.
@@ -110,7 +140,12 @@ def read(
     name = layout or layout_of(folder)
     if name not in LAYOUTS:
         raise OptionError("unknown layout", got=name, do=f"use one of {', '.join(LAYOUTS)}")
-    options = {"event_unit": event_unit, "missing": missing}
+    options = {
+        "event_unit": event_unit,
+        "missing": missing,
+        "trust_pickle": trust_pickle or None,
+        "threshold": threshold if "threshold" in LAYOUTS[name].options else None,
+    }
     given = {option: value for option, value in options.items() if value is not None}
     for option in given.keys() - set(LAYOUTS[name].options):
         able = [other for other in LAYOUTS if option in LAYOUTS[other].options]

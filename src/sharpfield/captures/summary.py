@@ -28,7 +28,11 @@ EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
 
 
 def summary(
-    path: Path | str, *, event_unit: str | None = None, layout: str | None = None
+    path: Path | str,
+    *,
+    event_unit: str | None = None,
+    layout: str | None = None,
+    trust_pickle: bool = False,
 ) -> dict[str, Any]:
     """What is at a path: a capture's folder, or a single file of events.
 
@@ -36,6 +40,7 @@ def summary(
         path: The folder or file.
         event_unit: Unit of the event times (ns, us, ms, s), where the file does not say.
         layout: Of the capture; by default it is recognised.
+        trust_pickle: Open pickled files, see `read`.
 
     Raises:
         CaptureError: It cannot be read.
@@ -45,7 +50,8 @@ def summary(
         with open_events(path, unit=event_unit) as file:
             told = file if file.unit else replace(file, unit=_unit_of_layout(path))
             return {"kind": "events", "name": path.name, "events": file_summary(told)}
-    return capture_summary(read(path, layout=layout, event_unit=event_unit))
+    capture = read(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
+    return capture_summary(capture)
 
 
 def capture_summary(capture: Capture) -> dict[str, Any]:

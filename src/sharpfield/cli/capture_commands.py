@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
-from sharpfield.captures import native, write_llff_events
+from sharpfield.captures import native, write_evdnerf, write_llff_events
 from sharpfield.captures.read import read
 from sharpfield.captures.summary import summary
 from sharpfield.core.capture import Capture
@@ -18,13 +18,20 @@ from sharpfield.preparation.deblur import DeblurOptions
 from sharpfield.preparation.deblur_report import deblur_to
 from sharpfield.simulation import (
     MOTIONS,
+    MOVING_RIG,
+    MOVING_SCENES,
+    MOVING_TIMING,
     SCENES,
     SENSORS,
     FrameSensor,
     Rig,
     Timing,
+    Views,
     folder_footage,
+    hand_held,
+    ring,
     simulate_footage,
+    simulate_moving,
     video_footage,
 )
 from sharpfield.simulation import simulate as simulate_scene
@@ -45,44 +52,95 @@ class Recording:
     colour: bool = False
     """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
 
-    def rig(self, size: tuple[int, int]) -> Rig:
-        """The two sensors."""
+    def sensors(self, base: Rig, size: tuple[int, int]) -> Rig:
+        """The two sensors behind the lens of a rig."""
         _known("sensor", self.sensor, SENSORS)
         events, frames = SENSORS[self.sensor], FrameSensor()
         if self.threshold is not None:
             events = replace(events, threshold_on=self.threshold, threshold_off=self.threshold)
         if self.colour:
             events, frames = replace(events, bayer="RGGB"), FrameSensor(encoding="linear")
-        return Rig(size, frames, events)
+        return replace(base, size=size, frame_sensor=frames, event_sensor=events)
 
 
-RECORDING, TIMING, DEBLURRING = Recording(), Timing(), DeblurOptions()
+@dataclass(frozen=True)
+class Around:
+    """Cameras before a moving scene; scenes that stand still have one, which moves."""
+
+    rig: Literal["ring", "hand"] = "ring"
+    """Cameras that stand around it, or one that is carried."""
+    views: int = 8
+    """Cameras on the ring."""
+    held_out: int = 4
+    """Further cameras, whose frames and events are for testing."""
+
+    def cameras(self, recording: Recording, seed: int) -> Views:
+        """Where they are."""
+        if self.rig == "hand":
+            return hand_held(recording.motion, seed=seed, held_out=self.held_out)
+        return ring(self.views, held_out=min(self.held_out, self.views))
+
+
+@dataclass(frozen=True)
+class Timed:
+    """When the shutter opens, and how finely light is sampled; in brackets for moving scenes."""
+
+    frames: int | None = None
+    """Of each camera: 18 (33)."""
+    exposure_us: int | None = None
+    """50000 (0: sharp frames)."""
+    interval_us: int | None = None
+    """From one exposure's start to the next: 56000 (31250)."""
+    step_us: int | None = None
+    """Between two pictures of the scene: 1000 (1250)."""
+    most_change: float | None = None
+    """Largest change of log intensity between two pictures, which are placed closer where it is
+    exceeded; 0 for even steps."""
+    test_every: int | None = None
+    """Every how many frames one is held out: 8; of a moving scene, of the held-out cameras."""
+
+    def over(self, base: Timing) -> Timing:
+        """A timing with what was given in place of its own."""
+        return replace(base, **{k: v for k, v in vars(self).items() if v is not None})
+
+
+RECORDING, AROUND, TIMED, DEBLURRING = Recording(), Around(), Timed(), DeblurOptions()
+STILL_SIZE, MOVING_SIZE = "240x160", "64x64"
 
 
 def simulate(
     out: Path,
     scene: str = "garden",
-    size: Size = "240x160",
-    layout: Literal["native", "ev-deblur-nerf"] = "native",
+    size: Size | None = None,
+    layout: Literal["native", "ev-deblur-nerf", "evdnerf"] = "native",
     seed: int = 0,
     recording: Recording = RECORDING,
-    timing: Timing = TIMING,
+    around: Around = AROUND,
+    timing: Timed = TIMED,
 ) -> None:
-    """Record a closed-form scene with a simulated camera: frames, events, poses, sharp truth.
+    """Record a closed-form scene with simulated cameras: frames, events, poses, sharp truth.
 
     Args:
         out: Folder of the capture.
-        scene: A scene by name: garden, shelf, tiles.
-        size: Of the sensor, in pixels.
+        scene: A scene by name: garden, shelf, tiles, mobile; or spinner, arm, jelly, which move
+            and are seen from all around.
+        size: Of the sensor, in pixels; by default 240x160, or 64x64 for a moving scene.
         layout: Files to write.
         seed: Of the camera path and of all noise.
         recording: Path and sensors.
+        around: Cameras of a moving scene.
         timing: Frames, exposures and sampling.
     """
-    _known("scene", scene, SCENES)
+    _known("scene", scene, [*SCENES, *MOVING_SCENES])
     _known("motion", recording.motion, MOTIONS)
-    rig = recording.rig(parse_size(size))
-    made = simulate_scene(scene, recording.motion, rig=rig, timing=timing, seed=seed)
+    if scene in MOVING_SCENES:
+        rig = recording.sensors(MOVING_RIG, parse_size(size or MOVING_SIZE))
+        views, timed = around.cameras(recording, seed), timing.over(MOVING_TIMING)
+        made = simulate_moving(scene, views, rig=rig, timing=timed, seed=seed)
+    else:
+        rig = recording.sensors(Rig(), parse_size(size or STILL_SIZE))
+        timed = timing.over(Timing())
+        made = simulate_scene(scene, recording.motion, rig=rig, timing=timed, seed=seed)
     write(replace(made, name=out.name), out, layout)
     _say_made(made, out)
 
@@ -118,6 +176,7 @@ def inspect(
     json: bool = False,
     layout: str | None = None,
     event_unit: str | None = None,
+    trust_pickle: bool = False,
 ) -> None:
     """Say what a capture, or a file of events, holds.
 
@@ -126,8 +185,10 @@ def inspect(
         json: Print JSON instead of text.
         layout: Of the capture, if it is not recognised.
         event_unit: Unit of event times (ns, us, ms, s), where the file does not say.
+        trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
+            are built from them, and anything else is refused.
     """
-    found = summary(path, layout=layout, event_unit=event_unit)
+    found = summary(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
     print(_as_json(found) if json else as_text(found))
 
 
@@ -151,7 +212,8 @@ def deblur(
 
 def write(capture: Capture, out: Path, layout: str) -> None:
     """Write a capture in a layout."""
-    {"native": native, "ev-deblur-nerf": write_llff_events}[layout].write(capture, out)
+    writers = {"native": native, "ev-deblur-nerf": write_llff_events, "evdnerf": write_evdnerf}
+    writers[layout].write(capture, out)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -189,5 +251,5 @@ def _known(name: str, value: str, names: Any) -> None:
 
 def _say_made(made: Capture, out: Path) -> None:
     frames = 0 if made.frames is None else len(made.frames)
-    events = 0 if made.events is None else len(made.events)
+    events = sum(len(one) for one in (made.events, made.test_events) if one is not None)
     Console().print(f"{frames} frames and {events:,} events are in {out}", highlight=False)

@@ -48,10 +48,13 @@ class Reading:
     """Frames to hold out: every:8, last:5 or none."""
     threshold: float | None = None
     """Contrast threshold of both signs."""
+    trust_pickle: bool = False
+    """Open pickled files, which may name programs to run; only arrays of numbers are built from
+    them, and anything else is refused."""
 
     def given(self) -> dict[str, Any]:
         """What was not left open."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        return {name: value for name, value in vars(self).items() if value not in (None, False)}
 
 
 @dataclass(frozen=True)
