@@ -81,7 +81,7 @@ class PlainHead(nn.Module):
     def __init__(self, head: PlaneHead) -> None:
         super().__init__()
         self.octaves = head.position, head.direction
-        self.density = nn.ModuleList(layer(part.weight) for part in head.body.layers)
+        self.density = nn.ModuleList(layer(part.weight) for part in (head.inside, head.out))
         first = torch.cat([head.first.of_sample, head.first.of_ray], 1)
         last = [part.weight for part in head.last.layers]
         self.colour = nn.ModuleList(layer(weight) for weight in (first, *last))

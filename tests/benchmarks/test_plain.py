@@ -56,7 +56,7 @@ def laid_out(volume: Volume, head: PlaneHead) -> dict[str, list[Tensor]]:
         "planes": [plane.grad.permute(2, 0, 1)[None] for plane in volume.planes],
         "lines": [line.grad.T[None, ..., None] for line in volume.lines],
         "basis": [volume.basis.weight.grad],
-        "density": [part.weight.grad for part in head.body.layers],
+        "density": [head.inside.weight.grad, head.out.weight.grad],
         "colour": [
             torch.cat([head.first.of_sample.grad, head.first.of_ray.grad], 1),
             *[part.weight.grad for part in head.last.layers],

@@ -32,7 +32,7 @@ def test_it_is_the_network_of_the_paper():
     joined = torch.cat([head.first.of_sample, head.first.of_ray], 1)
     x = torch.cat([head.to_feature(x), toward], -1) @ joined.T + head.first.bias
     wanted = torch.sigmoid(head.last(torch.relu(x)))
-    torch.testing.assert_close(head.colour(hidden, direction), wanted)
+    torch.testing.assert_close(head.colour(head.feature(hidden), direction), wanted)
 
 
 def test_nothing_is_looked_up():
@@ -48,7 +48,7 @@ def test_every_parameter_learns():
     head = MLPHead(generator=made(), width=8, depth=4)
     points = torch.randn(20, 7, 3)
     raw, hidden = head.density(points[..., :0], points)
-    (raw.sum() + head.colour(hidden, torch.randn(20, 3)).sum()).backward()
+    (raw.sum() + head.colour(head.feature(hidden), torch.randn(20, 3)).sum()).backward()
     assert all(p.grad is not None and p.grad.any() for p in head.parameters())
 
 
@@ -59,6 +59,6 @@ def test_gradients():
 
     def light(points: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         raw, hidden = head.density(points[..., :0], points)
-        return raw, head.colour(hidden, direction)
+        return raw, head.colour(head.feature(hidden), direction)
 
     assert torch.autograd.gradcheck(light, (points, direction))

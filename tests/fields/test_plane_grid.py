@@ -101,7 +101,7 @@ def test_multiplications(looked: int, size: HeadSize, golden: int):
     head, samples = PlaneHead(looked, size, generator=made()), 128
     with FlopCounterMode(display=False) as counter:
         _, hidden = head.density(torch.zeros(1, samples, looked), torch.zeros(1, samples, 3))
-        head.colour(hidden, torch.zeros(1, 3))
+        head.colour(head.feature(hidden), torch.zeros(1, 3))
     direction = 27 * size.colour
     wanted = samples * golden - (samples - 1) * direction
     assert counter.get_total_flops() == 2 * wanted
@@ -111,10 +111,10 @@ def test_a_head_is_its_plain_formulation():
     head, looked, points = field().coarse, torch.randn(6, 7, 5), places(6, 7)
     direction = torch.nn.functional.normalize(torch.randn(6, 3), dim=-1)
     raw, hidden = head.density(looked, points)
-    colour = head.colour(hidden, direction)
+    colour = head.colour(head.feature(hidden), direction)
 
     x = torch.cat([looked, frequencies(points, 3)], -1)
-    first, second = (layer.weight for layer in head.body.layers)
+    first, second = head.inside.weight, head.out.weight
     out = torch.relu(x @ first.T) @ second.T
     toward = frequencies(direction, 2)[:, None].expand(-1, 7, -1)
     joined = torch.cat([head.first.of_sample, head.first.of_ray], 1)
@@ -128,7 +128,10 @@ def test_half_precision_is_near_and_ends_in_float32():
     exact, rough = field().fine, field(precision=torch.bfloat16).fine
     looked, points, direction = torch.randn(6, 7, 10), places(6, 7), torch.randn(6, 3)
     (raw, hidden), (raw16, hidden16) = (head.density(looked, points) for head in (exact, rough))
-    colour, colour16 = exact.colour(hidden, direction), rough.colour(hidden16, direction)
+    colour, colour16 = (
+        head.colour(head.feature(seen), direction)
+        for head, seen in ((exact, hidden), (rough, hidden16))
+    )
     assert raw16.dtype == colour16.dtype == torch.float32 and hidden16.dtype == torch.bfloat16
     torch.testing.assert_close(raw16, raw, rtol=0.02, atol=0.03)
     torch.testing.assert_close(colour16, colour, rtol=0, atol=0.02)
@@ -159,7 +162,7 @@ def test_every_parameter_of_a_field_learns():
         (made_field.fine, close, torch.cat([old, new], 1)),
     ):
         raw, hidden = head.density(seen, points)
-        total = total + raw.sum() + head.colour(hidden, direction).sum()
+        total = total + raw.sum() + head.colour(head.feature(hidden), direction).sum()
     total.backward()
     assert all(p.grad is not None and p.grad.any() for p in made_field.parameters())
 

@@ -92,21 +92,21 @@ def test_composite_gathers_everything_by_weight() -> None:
 
 
 def test_skipped_samples_count_as_black() -> None:
-    weights = ops.weigh(*rays(2, 3, 5))
-    colour = torch.rand(2, 3, 5, 3, dtype=torch.float64, generator=generator(0, 0, "colour"))
+    weights = ops.weigh(*rays(6, 5))
+    colour = torch.rand(6, 5, 3, dtype=torch.float64, generator=generator(0, 0, "colour"))
     keep = weights > 0.1
     assert keep.any() and not keep.all()
-    found = ops.gather_kept(weights, keep, colour[keep])
+    found = ops.gather_kept(weights, keep.flatten().nonzero()[:, 0], colour[keep])
     torch.testing.assert_close(found, ops.gather(weights * keep, colour))
-    nothing = torch.zeros_like(keep)
-    assert not ops.gather_kept(weights, nothing, colour[nothing]).any()
+    nothing = torch.zeros(0, dtype=torch.int64)
+    assert not ops.gather_kept(weights, nothing, colour[:0, 0]).any()
 
 
 def test_gradient_of_kept_samples() -> None:
     weights = rays(3, 5)[0].requires_grad_()
-    keep = weights > 2
-    colour = torch.rand(int(keep.sum()), 3, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda w, c: ops.gather_kept(w, keep, c), (weights, colour))
+    kept = (weights > 2).flatten().nonzero()[:, 0]
+    colour = torch.rand(len(kept), 3, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda w, c: ops.gather_kept(w, kept, c), (weights, colour))
 
 
 def test_gaps_reach_to_the_next_sample_in_units_of_the_direction() -> None:

@@ -30,8 +30,11 @@ class SlabHead(nn.Module):
         inside = (points[..., 2] > self.begin) & (points[..., 2] < self.end)
         return self.density_inside * inside, points
 
-    def colour(self, hidden: Tensor, direction: Tensor) -> Tensor:
-        return self.light.expand(*hidden.shape[:-1], 3)
+    def feature(self, hidden: Tensor) -> Tensor:
+        return hidden
+
+    def colour(self, feature: Tensor, direction: Tensor) -> Tensor:
+        return self.light.expand(*feature.shape[:-1], 3)
 
 
 class Slab(nn.Module):

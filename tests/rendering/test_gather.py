@@ -50,7 +50,7 @@ def plain(head: PlaneHead, work: Work, how: Compositing) -> Found:
         order = work.order[..., None]
         looked = looked.gather(1, order.expand_as(looked))
         points = points.gather(1, order.expand_as(points))
-    first, second = (layer.weight for layer in head.body.layers)
+    first, second = head.inside.weight, head.out.weight
     out = torch.relu(torch.cat([looked, frequencies(points, 10)], -1) @ first.T) @ second.T
     raw, feature = out[..., 0], out[..., 1:]
     toward = frequencies(work.direction, 4)[:, None].expand(-1, SAMPLES, -1)

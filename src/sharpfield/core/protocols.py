@@ -52,17 +52,22 @@ class Trajectory(Protocol):
 class Head(Protocol):
     """A small network that turns what was looked up at points into density and colour.
 
-    The two are apart so that a renderer can leave out the colour of points nobody sees.
+    Its parts are asked one after the other, so that a renderer can leave out the later ones, which
+    cost most, for points that nobody sees.
     """
 
     def density(
         self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
-        """Density before its activation, and the hidden features that colour is made from."""
+        """Density before its activation, and what the features are made from."""
+        ...
+
+    def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s f"]:
+        """What colour is made from, and what other networks may read of a point."""
         ...
 
     def colour(
-        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+        self, feature: Float[Tensor, "*b s f"], direction: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b s c"]:
         """Linear colour, 0...1, seen along one direction per ray."""
         ...

@@ -49,12 +49,16 @@ class MLPHead(nn.Module):
         hidden = torch.relu(self.trunk(frequencies(points, self.position)))
         return self.to_density(hidden)[..., 0], hidden
 
+    def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s h"]:
+        """Those of the trunk."""
+        return hidden
+
     def colour(
-        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+        self, feature: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b s 3"]:
         """Linear colour, 0...1."""
         ray = frequencies(direction, self.direction)
-        seen = torch.relu(self.first(self.to_feature(hidden), ray))
+        seen = torch.relu(self.first(self.to_feature(feature), ray))
         return torch.sigmoid(self.last(seen))
 
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.ops.dense import Dense, SplitLinear, linear
+from sharpfield.ops.dense import Dense, SplitLinear, apply_linear, linear
 from sharpfield.ops.encoding import frequencies, frequencies_width
 from sharpfield.ops.grid import grid_shape, plane_line_mixture
 
@@ -105,7 +105,8 @@ class PlaneHead(nn.Module):
         self.position, self.direction = octaves
         self.precision = precision
         width = looked + frequencies_width(3, self.position)
-        self.body = Dense([width, size.hidden, size.feature + 1], generator=generator, bias=False)
+        self.inside = linear(width, size.hidden, generator=generator, bias=False)
+        self.out = linear(size.hidden, size.feature + 1, generator=generator, bias=False)
         self.first = SplitLinear(
             size.feature,
             frequencies_width(3, self.direction),
@@ -118,17 +119,21 @@ class PlaneHead(nn.Module):
     def density(
         self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
-        """Density before its activation, and features for the colour."""
+        """Density before its activation, and the hidden layer."""
         encoded = torch.cat([looked, frequencies(points, self.position)], -1)
-        out = self.body(encoded.to(self.precision))
-        return out[..., 0].float(), out[..., 1:]
+        hidden = torch.relu(apply_linear(self.inside.weight, None, encoded.to(self.precision)))
+        return apply_linear(self.out.weight[:1], None, hidden)[..., 0].float(), hidden
+
+    def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s f"]:
+        """What the layer that gives density gives besides."""
+        return apply_linear(self.out.weight[1:], None, hidden)
 
     def colour(
-        self, hidden: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
+        self, feature: Float[Tensor, "*b s f"], direction: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b s 3"]:
         """Linear colour, 0...1."""
-        ray = frequencies(direction, self.direction).to(hidden.dtype)
-        return torch.sigmoid(self.last(torch.relu(self.first(hidden, ray))).float())
+        ray = frequencies(direction, self.direction).to(feature.dtype)
+        return torch.sigmoid(self.last(torch.relu(self.first(feature, ray))).float())
 
 
 class PlaneField(nn.Module):

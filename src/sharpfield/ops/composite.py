@@ -11,7 +11,7 @@ sample follow the released code of Deblur-NeRF, DP-NeRF and Ev-DeblurNeRF.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from sharpfield.ops._dispatch import Op
@@ -99,20 +99,18 @@ def gather(weights: Float[Tensor, "*b s"], value: Float[Tensor, "*b s c"]) -> Fl
 
 
 def gather_kept(
-    weights: Float[Tensor, "*b s"], keep: Bool[Tensor, "*b s"], value: Float[Tensor, "n c"]
-) -> Float[Tensor, "*b c"]:
-    """Sum by weight when only the `n` samples marked in `keep` have a value; the rest are zero.
+    weights: Float[Tensor, "b s"], kept: Int64[Tensor, " n"], value: Float[Tensor, "n c"]
+) -> Float[Tensor, "b c"]:
+    """Sum by weight when only `n` samples have a value; the rest are zero.
 
     Args:
         weights: Of all samples.
-        keep: The samples whose value was computed, e.g. `weights > 1e-4`.
-        value: Theirs, in the order of `x[keep]`.
+        kept: The samples whose value was computed, counted along one ray after the other.
+        value: Theirs.
     """
-    leading, samples = weights.shape[:-1], weights.shape[-1]
-    ray = keep.reshape(-1, samples).nonzero()[:, 0]
-    total = value.new_zeros(leading.numel(), value.shape[-1])
-    total = total.index_add(0, ray, weights[keep][:, None] * value)
-    return total.reshape(*leading, value.shape[-1])
+    rays, samples = weights.shape
+    light = weights.flatten().index_select(0, kept)[:, None] * value
+    return value.new_zeros(rays, value.shape[-1]).index_add(0, kept // samples, light)
 
 
 def composite(

@@ -69,11 +69,11 @@ class Dense(nn.Module):
             if index in self.skips:
                 hidden = torch.cat([x, hidden], -1)
             assert isinstance(layer, nn.Linear)
-            hidden = _apply(layer.weight, layer.bias, hidden)
+            hidden = apply_linear(layer.weight, layer.bias, hidden)
         return hidden
 
 
-def _apply(
+def apply_linear(
     weight: Float[Tensor, "o i"], bias: Float[Tensor, "o"] | None, x: Float[Tensor, "*b i"]
 ) -> Float[Tensor, "*b o"]:
     """A linear layer in the precision of its input; its parameters stay as they are."""
@@ -114,8 +114,8 @@ class SplitLinear(nn.Module):
         self, sample: Float[Tensor, "*b s i"], ray: Float[Tensor, "*b j"]
     ) -> Float[Tensor, "*b s o"]:
         """W_sample sample + (W_ray ray + bias), the latter shared along a ray."""
-        shared = _apply(self.of_ray, self.bias, ray)
-        return _apply(self.of_sample, None, sample) + shared[..., None, :]
+        shared = apply_linear(self.of_ray, self.bias, ray)
+        return apply_linear(self.of_sample, None, sample) + shared[..., None, :]
 
 
 class FrameVectors(nn.Module):

@@ -145,7 +145,11 @@ def merge(
 
 def take_along(value: Float[Tensor, "*b t c"], order: Int[Tensor, "*b t"]) -> Tensor:
     """`value` with its samples in the given order."""
-    return value.gather(-2, order[..., None].expand_as(value))
+    count = value.shape[-2]
+    rays = value.shape[:-2].numel()
+    row = order.reshape(rays, count) + count * torch.arange(rays, device=order.device)[:, None]
+    # Whole rows at once: several times as fast as a gather of single numbers.
+    return value.reshape(-1, value.shape[-1]).index_select(0, row.flatten()).reshape(value.shape)
 
 
 def distortion(edges: Float[Tensor, "*b e"], weights: Float[Tensor, "*b s"]) -> Float[Tensor, "*b"]:

@@ -161,9 +161,12 @@ def _run(head: Head, work: Work, how: Compositing, known: Known | None, faint: f
     raw, hidden = head.density(looked, points)
     if known is not None:
         raw = known.raw.flatten().index_copy(0, known.asked, raw)
-    weights = _weights(raw.view(work.z.shape), work, how)
-    share = _as_they_come(weights, work)
-    seen = (share > faint).flatten()
+    raw = raw.view(work.z.shape)
+    if work.lit is not None:
+        raw = raw.masked_fill(~work.lit, -torch.inf)
+    weights = _weights(raw, work, how)
+    share = _clear(_as_they_come(weights, work), faint)
+    seen = (share > 0).flatten()
     kept = _marked(seen if known is None else seen[known.asked])
     feature = head.feature(hidden.index_select(0, kept))
     rgb = _mixed(head, work, feature, share, kept if known is None else known.asked[kept])
@@ -178,8 +181,8 @@ def _run_with_features(
     raw, hidden = head.density(work.looked, work.points)
     feature = head.feature(hidden)
     weights = _weights(raw, work, how)
-    share = _as_they_come(weights, work)
-    kept = _marked(share > faint)
+    share = _clear(_as_they_come(weights, work), faint)
+    kept = _marked(share > 0)
     rgb = _mixed(head, work, feature.flatten(0, 1).index_select(0, kept), share, kept)
     if work.order is not None:
         feature = stepfun.take_along(feature, work.order)
@@ -204,6 +207,11 @@ def _as_they_come(weights: Float[Tensor, "b s"], work: Work) -> Float[Tensor, "b
     if work.order is None:
         return weights
     return torch.zeros_like(weights).scatter(-1, work.order, weights)
+
+
+def _clear(share: Float[Tensor, "b s"], faint: float) -> Float[Tensor, "b s"]:
+    """Without what is faint, whether or not its colour is worked out: see `_marked`."""
+    return share * (share > faint)
 
 
 def _mixed(
