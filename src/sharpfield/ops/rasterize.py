@@ -173,7 +173,8 @@ def _blend(splats: Splats, colours: Float[Tensor, "v n c"], canvas: Canvas) -> D
 
     order = splats.depth.argsort(dim=1, stable=True)
     alpha = alpha.gather(1, order[..., None, None].expand_as(alpha))
-    left = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], 1), 1)
+    all_light = alpha.new_ones(len(alpha), 1, height, width)
+    left = torch.cumprod(torch.cat([all_light, 1 - alpha], 1), 1)
     weight = alpha * left[:, :-1]
     colours = colours.gather(1, order[..., None].expand_as(colours))
     depth = splats.depth.gather(1, order)
