@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sharpfield.core import Camera, Capture, Clock, EventStream, Exposure, Frames
-from sharpfield.geometry import BSpline, Stamped, se3
+from sharpfield.geometry import BSpline, Moved, Stamped, Still, Tracks, count_tracks, se3
 from sharpfield.geometry.normalise import PATH_SAMPLES, moved, normalised, reference_poses
 from sharpfield.geometry.space import Similarity, average_pose
 from tests.geometry.toy import points, poses
@@ -97,3 +97,28 @@ def test_a_smooth_path_is_looked_at_along_its_way():
     assert found.shape == (PATH_SAMPLES, 3, 4)
     ends = path.pose(torch.tensor([0.0, 1.0]), torch.zeros(2, dtype=torch.int64)).detach()
     np.testing.assert_allclose(found[[0, -1]], ends, atol=1e-6)
+
+
+def test_cameras_that_stand_still_need_no_frames():
+    standing = poses(4, turn=0.4).numpy()
+    rig = capture(frames=False, trajectory=Still(standing))
+    np.testing.assert_allclose(reference_poses(rig), standing, atol=1e-6)
+
+
+def test_depth_shrinks_with_the_world_and_flow_stays():
+    before = capture()
+    depth = np.full((3, 32, 40), 6.0, np.float32)
+    depth[0, 0, 0] = np.inf
+    flow = np.ones((3, 32, 40, 2), np.float32)
+    known = dataclasses.replace(before.frames, depth=depth, flow=flow)
+    after, change = normalised(dataclasses.replace(before, frames=known))
+    np.testing.assert_allclose(after.frames.depth, depth * change.scale)
+    np.testing.assert_array_equal(after.frames.flow, flow)
+
+
+def test_tracks_are_counted():
+    path, still = capture().trajectory, Still(poses(4, turn=0.4).numpy())
+    both = Tracks([path, path], still.poses)
+    change = Similarity(2.0, np.eye(3), np.zeros(3))
+    counts = [count_tracks(one) for one in (path, still, both, Moved(both, change))]
+    assert counts == [1, 4, 6, 6]

@@ -34,7 +34,7 @@ from sharpfield.captures.timed_views import (
 )
 from sharpfield.captures.transforms import number, read_json
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Note, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked, merged
 from sharpfield.core.exposure import Exposure
@@ -141,10 +141,10 @@ def _set(folder: Path, name: str) -> _Set:
 
 def _streams(
     folder: Path, sets: list[_Set], *, trust_pickle: bool, threshold: float | None
-) -> tuple[list[EventStream], dict[str, float | str]]:
+) -> tuple[list[EventStream], dict[str, Note]]:
     """The events of each view of all sets, and what there is to say about them."""
     streams: list[EventStream] = []
-    notes: dict[str, float | str] = {"clock": "said to last one second"}
+    notes: dict[str, Note] = {"clock": "said to last one second"}
     for one in sets:
         plain, sums = folder / f"data_{one.name}.npz", folder / f"data_frames_{one.name}.npy"
         pickled = [folder / name.format(one.name) for name in PICKLED]
@@ -173,7 +173,7 @@ def _streams(
     return streams, notes | _thresholds(folder, threshold)
 
 
-def _thresholds(folder: Path, threshold: float | None) -> dict[str, float | str]:
+def _thresholds(folder: Path, threshold: float | None) -> dict[str, Note]:
     """Those given or found; or those stated, if both signs' are."""
     if threshold is not None:
         return dict.fromkeys(THRESHOLDS, threshold)

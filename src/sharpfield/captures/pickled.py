@@ -45,7 +45,7 @@ def load_pickled(path: Path) -> list[Shaped[np.ndarray, "..."]]:
             got=error,
             do="save it as plain numbers with np.savez, one array for each camera",
         ) from None
-    arrays = list(found) if isinstance(found, list | tuple | np.ndarray) else [found]
+    arrays: list[Any] = list(found) if isinstance(found, list | tuple | np.ndarray) else [found]
     if not all(isinstance(array, np.ndarray) and array.dtype.kind in "iufb" for array in arrays):
         raise CaptureError("a pickled file holds more than arrays of numbers", where=path)
     return arrays

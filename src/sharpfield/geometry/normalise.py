@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.space import Similarity, normalisation
-from sharpfield.geometry.trajectory import Moved, Stamped, Tracks
+from sharpfield.geometry.trajectory import Moved, Stamped, Tracks, count_tracks
 
 REFERENCE = "reference_poses"
 """Note of a capture that says which poses its normalisation is taken over."""
@@ -21,7 +21,8 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
     """The poses that stand for a capture: its frames', or the moving track's.
 
     Published data sets average over one or the other; the note `reference_poses` ("frames" or
-    "trajectory") of a capture says which. Without frames it is the trajectory.
+    "trajectory") of a capture says which. Without frames it is the trajectory, of all cameras if
+    they stand still.
     """
     known = capture.trajectory.known_us(0)
     along = capture.notes.get(REFERENCE, "frames") == "trajectory" or capture.frames is None
@@ -34,7 +35,10 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
         time = torch.linspace(start, end, PATH_SAMPLES)
         along_it = capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES, dtype=torch.int64))
         return along_it.detach().double().numpy()
-    every = np.arange(len(capture.needed_frames))
+    if capture.frames is None:  # cameras that stand still
+        track = torch.arange(count_tracks(capture.trajectory))
+        return capture.trajectory.pose(torch.zeros(len(track)), track).detach().double().numpy()
+    every = np.arange(len(capture.frames))
     return capture.frame_pose(every).detach().double().numpy()
 
 

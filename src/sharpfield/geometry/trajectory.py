@@ -282,4 +282,5 @@ def count_tracks(path: Trajectory) -> int:
             return len(path.moving) + len(path.still.poses)
         case LearnedKnots() | Moved():
             return count_tracks(path.base)
-    return 1
+        case _:
+            return 1

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Note, Split
 from sharpfield.core.events import EventStream, merged
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
@@ -31,6 +31,9 @@ MOVING_TIMING = Timing(frames=33, exposure_us=0, interval_us=31_250, step_us=125
 """Sharp frames at both ends of 32 windows of one second; of a held-out camera, every eighth frame
 is for testing."""
 
+MAPS = ("threshold_on_map", "threshold_off_map")
+"""Notes of a recorder that give a number for each pixel."""
+
 RING = ring(8, held_out=4)
 
 
@@ -40,7 +43,7 @@ class _Track:
 
     frames: Frames
     events: EventStream
-    notes: dict[str, np.ndarray | float | str]
+    notes: dict[str, Note]
 
 
 def simulate_moving(
@@ -76,10 +79,9 @@ def simulate_moving(
     ]
     held_out = np.array([test for _, test in paths])
     frames = _joined([track.frames for track in recorded])
-    notes = {k: note for k, note in recorded[0].notes.items() if not isinstance(note, np.ndarray)}
+    notes = {k: note for k, note in recorded[0].notes.items() if k not in MAPS}
     if rig.event_sensor.threshold_sigma:
-        maps = ("threshold_on_map", "threshold_off_map")
-        notes |= {name: np.stack([track.notes[name] for track in recorded]) for name in maps}
+        notes |= {k: np.stack([np.asarray(one.notes[k]) for one in recorded]) for k in MAPS}
     return Capture(
         camera=rig.camera(),
         trajectory=_trajectory([path for path, _ in paths], clock),
@@ -142,14 +144,12 @@ def _joined(tracks: Sequence[Frames]) -> Frames:
 
 def _stream(tracks: Sequence[_Track], chosen: np.ndarray) -> EventStream:
     """The events of some tracks, in the order of time."""
+    found = [(k, tracks[k].events) for k in np.flatnonzero(chosen).tolist()]
+    last, _ = found[-1]
     return merged(
         [
-            replace(
-                tracks[k].events,
-                track=np.full(len(tracks[k].events), k, np.uint16),
-                tracks=int(np.flatnonzero(chosen)[-1]) + 1,
-            )
-            for k in np.flatnonzero(chosen)
+            replace(events, track=np.full(len(events), k, np.uint16), tracks=last + 1)
+            for k, events in found
         ]
     )
 
