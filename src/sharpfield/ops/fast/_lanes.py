@@ -286,9 +286,7 @@ def exponential(typing, row):
         value = same(EXPONENTIAL[-1])
         for coefficient in EXPONENTIAL[-2::-1]:
             value = multiply_add(value, rest, same(coefficient))
-        exponent = builder.add(
-            builder.fptosi(whole, bits), ir.Constant(bits, [127] * row.width)
-        )
+        exponent = builder.add(builder.fptosi(whole, bits), ir.Constant(bits, [127] * row.width))
         exponent = builder.shl(exponent, ir.Constant(bits, [23] * row.width))
         return builder.fmul(value, builder.bitcast(exponent, kind))
 

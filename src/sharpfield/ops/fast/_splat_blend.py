@@ -3,7 +3,8 @@
 
 A *splat* is a row of numbers: centre x, y, conic xx, xy, yy, opacity, half its height in pixels,
 then its *features*: the colour's channels and depth. A *touch* is a splat that reaches a tile: the
-splat's number, and the place where its gradient goes.
+splat's number, and the place where its gradient goes. A *plan* says where each worker's tiles and
+each tile's touches begin, and lists the touches.
 """
 
 import numpy as np
@@ -71,8 +72,9 @@ def _place(item, images):
 
 
 @kernel
-def blend(worker, workers, shares, starts, touches, splats, images, lanes, features):
+def blend(worker, workers, plan, splats, images, lanes, features):
     """Fill `images [v h w f+1]` with the sums of the features, and the light that gets through."""
+    shares, starts, touches = plan
     left = np.empty(TILE * TILE, np.float32)
     sums = np.empty(len(features) * TILE * TILE, np.float32)
     for item in range(shares[worker], shares[worker + 1]):
@@ -130,10 +132,13 @@ def _wanted_of_tile(item, images, wanted, gradient, behind, features):
 
 
 @kernel
-def blend_back(
-    worker, workers, shares, starts, touches, splats, images, wanted, touch_sums, lanes, features
-):
-    """Write the gradient of each touch: centre, conic, opacity, features."""
+def blend_back(worker, workers, plan, splats, pictures, touch_sums, lanes, features):
+    """Write the gradient of each touch: centre, conic, opacity, features.
+
+    The pictures are those that `blend` filled, and their gradient.
+    """
+    shares, starts, touches = plan
+    images, wanted = pictures
     size = TILE * TILE
     left = np.empty(size, np.float32)
     behind = np.empty(size, np.float32)

@@ -150,12 +150,13 @@ def _tiles(centre, half, size, between):
 
 
 @kernel
-def list_touches(worker, workers, splats, reach, slots, across, down, starts, touches):
+def list_touches(worker, workers, splats, reach, slots, tiles_of_view, starts, touches):
     """Fill `starts` with where the touches of each tile of each view begin, and the touches.
 
     A view is one worker's. Its touches keep their places among all touches, sorted by tile and,
     within a tile, by depth.
     """
+    across, down = tiles_of_view
     tiles = across * down
     views = (len(starts) - 1) // tiles
     count = len(reach) // views
@@ -213,10 +214,9 @@ def _sort_by_depth(depth, order, other, seen):
 
 
 @kernel
-def project_back(
-    worker, workers, gaussians, poses, lens, slots, splats, touch_sums, out, of_poses
-):
+def project_back(worker, workers, gaussians, poses, lens, touched, out, of_poses):
     """Gradients of the Gaussians, of their colours and shifts, and of the poses by chunks."""
+    slots, splats, touch_sums = touched
     means, quaternions, scales, opacities = gaussians
     of_means, of_quaternions, of_scales, of_opacities, of_colours, of_shift = out
     views, count, channels = of_colours.shape

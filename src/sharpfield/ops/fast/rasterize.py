@@ -66,13 +66,13 @@ class _Rasterize(torch.autograd.Function):
         tiles = [-(-side // TILE) for side in canvas.size]
         starts = np.zeros(views * tiles[0] * tiles[1] + 1, np.int64)
         touches = np.empty((slots[-1], 2), np.int32)
-        spread(list_touches, splats, reach, slots, tiles[0], tiles[1], starts, touches)
+        spread(list_touches, splats, reach, slots, (tiles[0], tiles[1]), starts, touches)
 
         width, height = canvas.size
         images = np.empty((views, height, width, channels + 2), np.float32)
-        shares = _shares(starts)
-        spread(blend, shares, starts, touches, splats, images, LANES, (0,) * (channels + 1))
-        ctx.canvas, ctx.plan = canvas, (splats, reach, slots, starts, touches, shares, images)
+        plan = _shares(starts), starts, touches
+        spread(blend, plan, splats, images, LANES, (0,) * (channels + 1))
+        ctx.canvas, ctx.drawn = canvas, (plan, splats, slots, images)
         ctx.save_for_backward(shift, *tensors)
         drawn = torch.from_numpy(images)
         # Copies: what is kept for the way back must not change with what the caller was given.
@@ -82,21 +82,19 @@ class _Rasterize(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         shift, means, quaternions, scales, opacities, colours, poses = ctx.saved_tensors
-        splats, _, slots, starts, touches, shares, images = ctx.plan
+        plan, splats, slots, images = ctx.drawn
         views, count, channels = colours.shape
         light, depth, opacity = gradients
         wanted = memory(torch.cat([light, depth[..., None], opacity[..., None]], -1))
-        touch_sums = np.empty((len(touches), splats.shape[1] - 1), np.float32)
+        touch_sums = np.empty((slots[-1], splats.shape[1] - 1), np.float32)
         features = (0,) * (channels + 1)
-        spread(
-            blend_back, shares, starts, touches, splats, images, wanted, touch_sums, LANES, features
-        )
+        spread(blend_back, plan, splats, (images, wanted), touch_sums, LANES, features)
         gaussians = tuple(memory(t) for t in (means, quaternions, scales, opacities))
         sums = tuple(torch.empty_like(t) for t in (means, quaternions, scales, opacities))
         of_colours, of_shift = torch.empty_like(colours), torch.empty(views, count, 2)
         of_poses = np.zeros((-(-count // CHUNK), views, 12), np.float32)
         spread(
-            project_back, gaussians, memory(poses), _lens(ctx.canvas), slots, splats, touch_sums,
+            project_back, gaussians, memory(poses), _lens(ctx.canvas), (slots, splats, touch_sums),
             tuple(memory(t) for t in (*sums, of_colours, of_shift)), of_poses,
         )  # fmt: skip
         pose_sum = torch.from_numpy(of_poses.sum(0, dtype=np.float64).astype(np.float32))
