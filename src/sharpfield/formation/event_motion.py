@@ -32,12 +32,12 @@ class EventMotion:
         Raises:
             CaptureError: There are no events, or they and the frames differ in size.
         """
-        events, frames = capture.needed_events, capture.needed_frames
-        if (events.width, events.height) != (frames.width, frames.height):
+        events, camera = capture.needed_events, capture.camera
+        if (events.width, events.height) != camera.size:
             raise CaptureError(
                 "deblurring needs events and frames of the same pixels",
                 where=capture.name,
-                got=f"events {events.width}x{events.height}, frames {frames.width}x{frames.height}",
+                got=f"events {events.width}x{events.height}, frames {camera.width}x{camera.height}",
                 do="warp one to the other first",
             )
         size = {"width": events.width, "height": events.height}

@@ -159,6 +159,11 @@ class EventSplat(Splat):
 
     looks: LookOptions = field(default_factory=lambda: LookOptions(sharp=0.0, windows=1.0))
 
+    def build(self, capture: Capture, seed: int) -> SplatModel:
+        """On the events alone, whatever else there is."""
+        assert capture.needed_events is not None
+        return SplatModel(self, capture.without(frames=True), seed)
+
 
 @dataclass(frozen=True)
 class EvSplat(Splat):
