@@ -42,14 +42,14 @@ BASELINES = (
     Contender("nerf", "nerf", deblurred=False, use=("frames",)),
     Contender("edi-nerf", "nerf", deblurred=True, use=("frames",)),
 )
-OURS = Contender("ev-deblur-nerf", "ev-deblur-nerf", deblurred=False, use=("frames", "events"))
+OURS = Contender("ev-splat", "ev-splat", deblurred=False, use=("frames", "events"))
 
 
 def demo(
     out: Path = Path("runs/demo"),
-    size: str = "120x80",
+    size: str = "240x160",
     scene: str = "garden",
-    minutes: float = 1.1,
+    minutes: float = 1.0,
     seed: int = 0,
     device: str = "auto",
 ) -> None:

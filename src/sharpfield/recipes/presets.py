@@ -16,6 +16,7 @@ from sharpfield.recipes.frame_term import FrameOptions
 from sharpfield.recipes.learned_blur import KernelOptions
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.prior import PriorOptions
+from sharpfield.recipes.splats import Splat
 from sharpfield.recipes.volume import VolumeOptions
 
 
@@ -144,7 +145,32 @@ def nerf_paper(recipe: NeRF) -> NeRF:
     return NeRF()
 
 
+def refine(recipe: Splat) -> Splat:
+    """Thresholds, poses and the clocks' offset are learned, too."""
+    unknowns = replace(recipe.unknowns, thresholds="signs", knots=REFINED_KNOTS, offset=True)
+    return replace(recipe, unknowns=unknowns)
+
+
+def splat_draft(recipe: Splat) -> Splat:
+    """Minutes on two processor cores."""
+    return recipe.lasting(6000)
+
+
+def splat_standard(recipe: Splat) -> Splat:
+    """Minutes on a graphics card: more Gaussians, which shine, and more views of each exposure."""
+    return replace(
+        recipe.lasting(15_000),
+        gaussians=replace(recipe.gaussians, degree=3, density=1.5),
+        looks=replace(recipe.looks, instants=max(recipe.looks.instants, 5)),
+    )
+
+
 Change = Callable[[Any], Any]
+SPLATS = ("splat", "edi-splat", "blur-splat", "event-splat", "ev-splat")
+
+REFINED_KNOTS = 48
+"""Knots of a refined trajectory."""
+
 VARIANTS: Mapping[str, Mapping[str, Change]] = {
     "ev-deblur-nerf": {
         "physical": physical,
@@ -153,12 +179,14 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
         "cdavis_full": cdavis_full,
     },
     "nerf": {},
+    **dict.fromkeys(SPLATS, {"refine": refine}),
 }
 """What is modelled, by recipe."""
 
 SIZES: Mapping[str, Mapping[str, Change]] = {
     "ev-deblur-nerf": {"draft": draft, "standard": standard, "paper": paper},
     "nerf": {"draft": nerf_draft, "standard": nerf_standard, "paper": nerf_paper},
+    **dict.fromkeys(SPLATS, {"draft": splat_draft, "standard": splat_standard}),
 }
 """How much of it, by recipe."""
 
@@ -195,7 +223,7 @@ def prepared(recipe: str, start: Any, preset: str, *, capture: Capture, device: 
             )
     if sizes and not any(name in sizes for name in chosen):
         chosen.append("draft" if device == "cpu" else "standard")
-    if variants and not any(name in variants for name in chosen):
+    if variants and not any(name in variants for name in chosen) and recipe not in SPLATS:
         coloured = capture.events is not None and capture.events.coloured
         published = "cdavis_full" if coloured else "blender_full"
         chosen.insert(0, published if "paper" in chosen else "physical")

@@ -53,7 +53,9 @@ class GaussianOptions:
     """The Gaussians, how they start and how they grow."""
 
     budget: int = 0
-    """Most of them; 0 takes one for every third pixel of a frame."""
+    """Most of them; 0 takes `density` for every pixel of a frame."""
+    density: float = 1 / 3
+    """Gaussians for each pixel of a frame, without a budget."""
     degree: int = 1
     """Of the spherical harmonics of colour: 0 looks the same from everywhere, at most 3."""
     start: float = 1.0
@@ -68,7 +70,7 @@ class GaussianOptions:
     """Steps between two rounds of growing."""
     grow_until: float = 0.85
     """Part of the schedule after which their number and places in line stay."""
-    idle: float = 0.003
+    idle: float = 0.01
     """Weight of mean opacity and of mean scale, with `markov`."""
     noise: float = 5e4
     """Of transparent means relative to their rate, with `markov`; the paper has 5e5."""
@@ -184,4 +186,4 @@ class SplatScene(nn.Module):
 def budget_of(options: GaussianOptions, capture: Capture) -> int:
     """Most Gaussians there may be."""
     width, height = capture.camera.size
-    return options.budget or max(width * height // 3, LEAST)
+    return options.budget or max(round(width * height * options.density), LEAST)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
@@ -87,19 +87,18 @@ class Unknowns(nn.Module):
             return 0.0
         return float(self.offset_steps.detach()) * OFFSET_UNIT_US
 
+    def both_thresholds(self) -> tuple[float, float]:
+        """The thresholds to darker and to brighter, without what single pixels differ by."""
+        if isinstance(self.thresholds, FixedThresholds):
+            return self.guess
+        negative, positive = (self.thresholds.log_guess + self.thresholds.log_factor).exp().tolist()
+        return negative, positive
+
     def on_time(self, time: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """When what events report really happened, both 0...1 of the capture."""
         if self.offset_steps is None:
             return time
         return time - self.offset_steps * (OFFSET_UNIT_US / self.clock.span_us)
-
-    def exposed(
-        self, light: Float[Tensor, "m h w c"], frame: Int64[Tensor, "m"]
-    ) -> Float[Tensor, "m h w c"]:
-        """The light as a frame of that gain records it."""
-        if self.log_gain is None:
-            return light
-        return light * self.log_gain[frame].exp()[:, None, None, None]
 
     def prior(self) -> Float[Tensor, ""] | None:
         """What keeps the learned near its start; None if nothing needs it."""

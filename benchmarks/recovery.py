@@ -1,0 +1,127 @@
+"""What a camera does not tell, found again: thresholds, poses and the clocks' offset.
+
+    python -m benchmarks.recovery [--minutes 6] [--size 160x104] [--out runs/recovery]
+
+A simulated camera has thresholds of 0.23 and 0.31; `ev-splat` starts from 0.25 for both, from poses
+that are off by 0.4 degrees and 1 % of the scene's depth (smoothly, as those of an encoder or of
+structure from motion), and from events that are 2 ms late. The capture is written to disk and
+trained by the same code as the command line's, with the preset `refine`.
+"""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from benchmarks.table import save, show
+from sharpfield.captures import native
+from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.runs import measure, open_run, start
+from sharpfield.core.capture import Capture
+from sharpfield.geometry import Stamped, se3
+from sharpfield.metrics.pose import absolute_error
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.saved import Started
+from sharpfield.simulation import EventSensor, Rig, Timing, simulate
+from sharpfield.training import Options
+
+THRESHOLDS, GUESS = (0.23, 0.31), (0.25, 0.25)
+LATE_US = 2000
+OFF_DEG, OFF_OF_DEPTH = 0.4, 0.01
+WAVES = 5
+"""The error of the poses has this many half waves along the recording, and fewer."""
+
+
+def recorded(size: tuple[int, int], seed: int) -> Capture:
+    """A capture with everything known, noise-free but for its thresholds."""
+    darker, brighter = THRESHOLDS
+    sensor = EventSensor(threshold_off=darker, threshold_on=brighter)
+    timing = Timing(frames=26, exposure_us=50_000, interval_us=56_000)
+    return simulate("garden", "shaky", rig=Rig(size, event_sensor=sensor), timing=timing, seed=seed)
+
+
+def spoiled(truth: Capture, seed: int) -> Capture:
+    """The same capture as a user would have it."""
+    path, events = truth.trajectory, truth.needed_events
+    assert isinstance(path, Stamped)
+    random = np.random.default_rng(seed)
+    part = (path.times_us - path.times_us[0]) / np.ptp(path.times_us)
+    waves = np.cos(np.pi * np.arange(1, WAVES + 1) * part[:, None])
+    error = waves @ random.normal(size=(WAVES, 6))
+    error -= error.mean(0)
+    depth = np.sqrt(truth.near * truth.far)
+    for axes, most in ((slice(0, 3), np.deg2rad(OFF_DEG)), (slice(3, 6), OFF_OF_DEPTH * depth)):
+        length = np.sqrt((error[:, axes] ** 2).sum(-1).mean())
+        error[:, axes] *= most / length
+    poses = se3.compose(torch.from_numpy(path.poses), se3.exp(torch.from_numpy(error))).numpy()
+    notes = {k: v for k, v in truth.notes.items() if not k.startswith("threshold")}
+    return replace(
+        truth,
+        trajectory=Stamped(path.times_us, poses, truth.clock),
+        events=replace(events, t_us=events.t_us + LATE_US),
+        notes=notes,
+        name="spoiled",
+    )
+
+
+def pose_error(capture: Capture, truth: Capture) -> tuple[float, float]:
+    """Degrees, and percent of the scene's depth, at the frames' middles after a similarity."""
+    every = np.arange(len(truth.needed_frames))
+    found = capture.frame_pose(every).detach().double()
+    error = absolute_error(found, truth.frame_pose(every).double())
+    return error.rotation_deg, 100 * error.translation / float(np.sqrt(truth.near * truth.far))
+
+
+def main() -> None:
+    """Run, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--size", default="160x104")
+    parser.add_argument("--out", type=Path, default=Path("runs/recovery"))
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    console = Console()
+    truth = recorded(parse_size(asked.size), asked.seed)
+    capture = spoiled(truth, asked.seed + 1)
+    native.write(truth, asked.out / "truth")
+    native.write(capture, asked.out / "capture")
+    rows = []
+    for name, preset in (("believed", "draft"), ("refined", "refine,draft")):
+        run = asked.out / name
+        recipe = prepared(
+            "ev-splat", recipe_named("ev-splat")(), preset, capture=capture, device="cpu"
+        )
+        recipe = replace(recipe, unknowns=replace(recipe.unknowns, threshold=GUESS))
+        started = Started("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
+        start(started, capture, run, Options(minutes=asked.minutes), device="cpu", console=console)
+        opened = open_run(run, capture=None, device="cpu")
+        metrics = measure(opened, run, console)
+        rows.append(_row(name, opened.model, metrics, truth))
+    show(rows)
+    print(save("recovery", rows, {"minutes": str(asked.minutes), "size": asked.size}))
+
+
+def _row(name: str, model: Any, metrics: dict[str, Any], truth: Capture) -> dict[str, Any]:
+    darker, brighter = model.unknowns.both_thresholds()
+    degrees, percent = pose_error(model.capture, truth)
+    return {
+        "poses": name,
+        "darker": darker,
+        "off %": 100 * (darker / THRESHOLDS[0] - 1),
+        "brighter": brighter,
+        "off % ": 100 * (brighter / THRESHOLDS[1] - 1),
+        "late us": model.unknowns.offset_us,
+        "pose deg": degrees,
+        "pose % depth": percent,
+        "psnr": metrics["mean"]["psnr"],
+        "ssim": metrics["mean"]["ssim"],
+    }
+
+
+if __name__ == "__main__":
+    main()
