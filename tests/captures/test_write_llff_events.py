@@ -149,6 +149,9 @@ def refusals(tiny):
         "lens distortion": replace(
             tiny, camera=Camera(12, 10, 11.0, 11.0, 6.0, 5.0, "brown", (0.1, 0.0, 0.0, 0.0, 0.0))
         ),
+        "events of several cameras": replace(
+            tiny, events=replace(tiny.events, track=np.zeros(5_000, np.uint16), tracks=2)
+        ),
         "principal point": replace(tiny, camera=Camera(12, 10, 11.0, 11.0, 6.5, 5.0)),
         "8-bit RGB": replace(tiny, frames=replace(tiny.frames, images=deep)),
         "images other than gamma2.2 beside mono events": replace(
@@ -173,6 +176,7 @@ def refusals(tiny):
     "what",
     [
         "lens distortion",
+        "events of several cameras",
         "principal point",
         "8-bit RGB",
         "images other than gamma2.2 beside mono events",

@@ -2,8 +2,9 @@
 
 A mono event camera gives the Blender variant (times in ns), a colour one the Color-DAVIS variant
 (times in us, `ev_map.npz`). The layout has no place for lens distortion, a principal point off the
-centre, other than 8-bit RGB images, or another choice of held-out frames; a capture with these is
-refused. Sparse points and notes but the thresholds are left out, and images are numbered anew.
+centre, other than 8-bit RGB images, events of several cameras, or another choice of held-out
+frames; a capture with these is refused. Sparse points and notes but the thresholds are left out,
+and images are numbered anew.
 """
 
 from dataclasses import dataclass
@@ -180,6 +181,8 @@ def _rectified_sites(
 
 def _expect_expressible(capture: Capture, variant: Variant) -> None:
     camera, frames = capture.camera, capture.needed_frames
+    if capture.needed_events.tracks > 1 or capture.test_events is not None:
+        raise _not_expressible("events of several cameras", type(capture.trajectory).__name__)
     centre = (camera.width / 2, camera.height / 2)
     if camera.lens != "pinhole" or camera.fx_px != camera.fy_px:
         raise _not_expressible("lens distortion or oblong pixels", camera)

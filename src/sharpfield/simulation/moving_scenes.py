@@ -21,8 +21,8 @@ GREY = ("#565c66", "#565c66")
 TURN = 2 * np.pi
 
 TABLE: list[Part] = [
-    (0, box((0, 0, -1.1), (2.2, 2.2, 0.2), Paint("#efe3cc", "#2d6a8e", "#d98c3f", TILES, 1.6))),
-    (0, ball((-0.85, -0.8, -0.82), 0.18, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 9, 21))),
+    (0, box((0, 0, -1.1), (2.2, 2.2, 0.2), Paint("#efe3cc", "#2d6a8e", "#d98c3f", TILES, 1.4))),
+    (0, ball((-0.85, -0.8, -0.82), 0.18, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 6, 21))),
     (
         0,
         box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)),
@@ -52,7 +52,7 @@ Moving = tuple[list[Part], Callable[[float], list[Map]]]
 
 def _spinner() -> Moving:
     """Rigid: a rotor with three painted arms that turns, sways and bobs."""
-    hub = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 4.2)
+    hub = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 2.3)
     rod = Paint("#9a6b41", "#d9ab78", texture=WOOD, cells=5, seed=4)
     parts = [
         *TABLE,
@@ -60,16 +60,16 @@ def _spinner() -> Moving:
         (1, box((0.45, 0, 0.1), (0.9, 0.12, 0.12), rod)),
         (1, box((-0.42, 0, -0.15), (0.84, 0.12, 0.12), rod)),
         (1, box((0, 0.4, 0.2), (0.12, 0.8, 0.12), rod)),
-        (1, ball((0.9, 0, 0.1), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=9))),
+        (1, ball((0.9, 0, 0.1), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5))),
         (
             1,
             box(
                 (-0.82, 0, -0.15),
                 (0.3, 0.3, 0.3),
-                Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 8),
+                Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 5),
             ),
         ),
-        (1, ball((0, 0.78, 0.2), 0.17, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 6, 5))),
+        (1, ball((0, 0.78, 0.2), 0.17, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 4, 5))),
     ]
 
     def maps(t: float) -> list[Map]:
@@ -82,8 +82,8 @@ def _spinner() -> Moving:
 
 def _arm() -> Moving:
     """Articulated: a robot arm of four joints whose gripper opens and closes."""
-    steel = Paint("#d7dde4", "#5b6b7c", "#f2b134", STRIPES, 9, slant=0.5)
-    limb = Paint("#e8743b", "#5c1f12", "#f9e0b8", BRICKS, 7)
+    steel = Paint("#d7dde4", "#5b6b7c", "#f2b134", STRIPES, 6, slant=0.5)
+    limb = Paint("#e8743b", "#5c1f12", "#f9e0b8", BRICKS, 4.5)
     parts = [
         *TABLE,
         (
@@ -91,16 +91,16 @@ def _arm() -> Moving:
             box(
                 (0, 0, -0.92),
                 (0.62, 0.62, 0.16),
-                Paint("#efe9dc", "#2f6f6a", texture=CHECKS, cells=8),
+                Paint("#efe9dc", "#2f6f6a", texture=CHECKS, cells=5),
             ),
         ),
         (1, box((0, 0, 0.14), (0.46, 0.46, 0.28), steel)),
-        (2, ball((0, 0, 0), 0.22, Paint("#f5f0e6", "#2456a6", texture=CHECKS, cells=9))),
+        (2, ball((0, 0, 0), 0.22, Paint("#f5f0e6", "#2456a6", texture=CHECKS, cells=5))),
         (2, box((0, 0, 0.36), (0.28, 0.3, 0.72), limb)),
-        (3, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=10))),
+        (3, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5.5))),
         (
             3,
-            box((0, 0, 0.28), (0.23, 0.25, 0.56), Paint("#f3ead8", "#7b1e3a", "#2e7d58", TILES, 6)),
+            box((0, 0, 0.28), (0.23, 0.25, 0.56), Paint("#f3ead8", "#7b1e3a", "#2e7d58", TILES, 4)),
         ),
         (4, box((0, 0, 0.07), (0.4, 0.2, 0.12), steel)),
         (
@@ -108,7 +108,7 @@ def _arm() -> Moving:
             box(
                 (0, 0, 0.1),
                 (0.1, 0.18, 0.26),
-                Paint("#f4d06f", "#8f2d56", texture=STRIPES, cells=12),
+                Paint("#f4d06f", "#8f2d56", texture=STRIPES, cells=8),
             ),
         ),
         (
@@ -116,7 +116,7 @@ def _arm() -> Moving:
             box(
                 (0, 0, 0.1),
                 (0.1, 0.18, 0.26),
-                Paint("#7fb069", "#24476b", texture=STRIPES, cells=12),
+                Paint("#7fb069", "#24476b", texture=STRIPES, cells=8),
             ),
         ),
     ]
@@ -134,7 +134,7 @@ def _arm() -> Moving:
     return parts, maps
 
 
-LAYERS, LAYER = 6, 0.22
+LAYERS, LAYER = 4, 0.33
 """Layers of the jelly tower, and how high each is at rest."""
 
 
@@ -146,10 +146,10 @@ def _jelly() -> Moving:
     parts = [*TABLE]
     parts += [(k + 1, box(middle, (0.62, 0.62, LAYER), paint)) for k in range(LAYERS)]
     parts += [
-        (LAYERS + 1, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=8))),
+        (LAYERS + 1, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=5))),
         (
             LAYERS + 2,
-            ball((0, 0, 0), 0.2, Paint("#f4d06f", "#24476b", "#ffffff", LEAVES, 9)),
+            ball((0, 0, 0), 0.2, Paint("#f4d06f", "#24476b", "#ffffff", LEAVES, 5)),
         ),
     ]
 
