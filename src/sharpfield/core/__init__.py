@@ -14,7 +14,7 @@ from sharpfield.core.events import EventStream, SiteColour, merged
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.core.growth import Growth
-from sharpfield.core.measurements import Batch, EventPairs, Pixels
+from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.paper import Paper
 from sharpfield.core.protocols import (
     Field,
@@ -31,6 +31,7 @@ from sharpfield.core.radiance import Radiance, Samples
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.struct import Struct
+from sharpfield.core.views import Views
 
 __all__ = [
     "Batch",
@@ -48,6 +49,7 @@ __all__ = [
     "Growing",
     "Growth",
     "Head",
+    "Instants",
     "MissingExtra",
     "Model",
     "OptionError",
@@ -67,5 +69,6 @@ __all__ = [
     "Split",
     "Struct",
     "Trajectory",
+    "Views",
     "merged",
 ]

@@ -33,7 +33,7 @@ class SharpInstants:
         self.frames, self.motion, self.thresholds = capture.needed_frames, motion, thresholds
         self.tone = tone_of(self.frames.encoding)
         exposure, train = self.frames.exposure, capture.split.train
-        self.order: Int64[np.ndarray, "n"] = train[np.argsort(exposure.middle_us[train])]
+        self.order: Int64[np.ndarray, n] = train[np.argsort(exposure.middle_us[train])]
         self.span_us = (
             int(exposure.open_us[self.order].min()),
             int(exposure.close_us[self.order].max()),
