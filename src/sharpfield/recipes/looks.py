@@ -20,10 +20,10 @@ from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.seed import number, numpy_generator
 from sharpfield.formation.event_counts import counts_between
 from sharpfield.formation.event_motion import EventMotion
-from sharpfield.formation.sharp_instants import SharpInstants
+from sharpfield.formation.sharp_instants import Belief, SharpInstants
 from sharpfield.ops.permutation import shuffled
 
-Times = Int64[np.ndarray, "k"]
+Times = Int64[np.ndarray, "_"]
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class LookOptions:
     sharp: float = 0.2
     """Weight of the sharp pictures from events in late steps; in early ones it is 1. 0 leaves them
     out altogether."""
-    windows: float = 0.05
-    """Weight of the events counted between instants; 0 leaves them out."""
+    windows: float = 0.002
+    """Weight of the squared error of the number of events between instants; 0 leaves them out."""
     shortest_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
     longest_us: int = 50_000
@@ -74,7 +74,6 @@ class Looks:
     Args:
         options: What they are made of.
         capture: In the model's space.
-        thresholds: Of the events, to darker and to brighter, for the sharp pictures.
         seed: Of the run.
     """
 
@@ -82,7 +81,6 @@ class Looks:
         self,
         options: LookOptions,
         capture: Capture,
-        thresholds: tuple[float, float],
         seed: int,
     ) -> None:
         self.options, self.capture, self.seed = options, capture, seed
@@ -98,9 +96,9 @@ class Looks:
             self.motion = EventMotion.of(capture)
         known = capture.notes.get("motion") != "unknown"
         if self.motion is not None and frames is not None and options.sharp > 0 and known:
-            self.sharp = SharpInstants(capture, self.motion, thresholds)
+            self.sharp = SharpInstants(capture, self.motion)
 
-    def instant(self, step: int, late_us: int) -> Batch:
+    def instant(self, step: int, belief: Belief) -> Batch:
         """A single view of a sharp picture, anywhere between the first and the last exposure."""
         assert self.sharp is not None
         random = numpy_generator(self.seed, step, "look")
@@ -108,10 +106,10 @@ class Looks:
         part, frame = self._part(random), int(self.sharp.order[0])
         return {
             "look": self._instants(times, np.ones(1), frame, part),
-            "sharp": self._sharp(times, frame, part, late_us),
+            "sharp": self._sharp(times, frame, part, belief),
         }
 
-    def exposure(self, step: int, *, events: bool, late_us: int = 0) -> Batch:
+    def exposure(self, step: int, *, events: bool, belief: Belief) -> Batch:
         """Views of one exposure, and with events of an instant beside it."""
         random = numpy_generator(self.seed, step, "look")
         frames, part = self.capture.needed_frames, self._part(random)
@@ -129,7 +127,7 @@ class Looks:
             "frames": self._frame_pixels(frame, part),
         }
         if self.sharp is not None:
-            batch["sharp"] = self._sharp(times, frame, part, late_us)
+            batch["sharp"] = self._sharp(times, frame, part, belief)
         if windows:
             batch["events"] = self._windows(times, part)
         return batch
@@ -209,10 +207,10 @@ class Looks:
             (image.to(torch.float32) / frames.white)[None], frame, (opens, closes), part
         )
 
-    def _sharp(self, times: Times, frame: int, part: Part, late_us: int) -> Pixels:
+    def _sharp(self, times: Times, frame: int, part: Part, belief: Belief) -> Pixels:
         """Sharp pictures `[1, h, w, k]` at some instants."""
         assert self.sharp is not None
-        value = torch.stack([part.of(self.sharp.at(int(t), late_us)) for t in times], 2)[None]
+        value = torch.stack([part.of(self.sharp.at(int(t), belief)) for t in times], 2)[None]
         time = torch.from_numpy(self.capture.clock.unit(times)).float()
         return self._pixels(value, frame, (time, time), part)
 
