@@ -23,7 +23,6 @@ from sharpfield.cli.capture_commands import parse_size
 from sharpfield.cli.runs import measure, open_run, start
 from sharpfield.core.capture import Capture
 from sharpfield.geometry import Stamped, se3
-from sharpfield.metrics.pose import absolute_error
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.saved import Started
@@ -70,11 +69,22 @@ def spoiled(truth: Capture, seed: int) -> Capture:
 
 
 def pose_error(capture: Capture, truth: Capture) -> tuple[float, float]:
-    """Degrees, and percent of the scene's depth, at the frames' middles after a similarity."""
+    """Root mean square errors at the frames' middles after the best similarity.
+
+    In degrees, and in percent of the scene's depth. The turn of the similarity is taken from where
+    the cameras look, not from where they are: a hand that shakes does not go far.
+    """
     every = np.arange(len(truth.needed_frames))
-    found = capture.frame_pose(every).detach().double()
-    error = absolute_error(found, truth.frame_pose(every).double())
-    return error.rotation_deg, 100 * error.translation / float(np.sqrt(truth.near * truth.far))
+    found, known = (c.frame_pose(every).detach().double() for c in (capture, truth))
+    u, _, vt = torch.linalg.svd((known[..., :3] @ found[..., :3].mT).sum(0))
+    turn = u @ vt
+    centre = found[..., 3] @ turn.T
+    centre, goal = centre - centre.mean(0), known[..., 3] - known[..., 3].mean(0)
+    scale = (centre * goal).sum() / centre.square().sum()
+    off = (known[..., :3].mT @ turn @ found[..., :3]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    degrees = torch.rad2deg(torch.acos(((off - 1) / 2).clamp(-1, 1))).square().mean().sqrt()
+    away = (scale * centre - goal).square().sum(-1).mean().sqrt()
+    return float(degrees), 100 * float(away) / float(np.sqrt(truth.near * truth.far))
 
 
 def main() -> None:

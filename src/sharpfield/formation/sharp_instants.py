@@ -5,9 +5,11 @@ during and after (see `formation.edi`). Inside an exposure its own picture is ca
 instant; between two exposures both are, and their log light is averaged by how near they are.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
@@ -18,62 +20,78 @@ from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
 
 
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of the event camera."""
+
+    negative: float
+    """Contrast threshold to darker."""
+    positive: float
+    """Contrast threshold to brighter."""
+    late_us: int = 0
+    """By how much its clock is late against that of the frames."""
+
+
 class SharpInstants:
     """Pictures between the first and the last exposure of the training frames.
 
     Args:
         capture: With frames and events.
         motion: Of its events.
-        thresholds: To darker and to brighter.
     """
 
-    def __init__(
-        self, capture: Capture, motion: EventMotion, thresholds: tuple[float, float]
-    ) -> None:
-        self.frames, self.motion, self.thresholds = capture.needed_frames, motion, thresholds
+    def __init__(self, capture: Capture, motion: EventMotion) -> None:
+        self.frames, self.motion = capture.needed_frames, motion
         self.tone = tone_of(self.frames.encoding)
         exposure, train = self.frames.exposure, capture.split.train
-        self.order: Int64[np.ndarray, n] = train[np.argsort(exposure.middle_us[train])]
+        self.order = train[np.argsort(exposure.middle_us[train])]
         self.span_us = (
             int(exposure.open_us[self.order].min()),
             int(exposure.close_us[self.order].max()),
         )
-        fixed = FixedThresholds(*thresholds)
-        self.log_mean = {
-            int(frame): motion.path(
-                exposure.window(int(frame)), exposure.open_us[frame : frame + 1], fixed
-            ).log_mean.half()
-            for frame in self.order
-        }
+        self._log_means: dict[tuple[int, Belief], Tensor] = {}
 
-    def at(self, time_us: int, late_us: int = 0) -> Float[Tensor, "h w c"]:
+    def at(self, time_us: int, belief: Belief) -> Float[Tensor, "h w c"]:
         """The picture at a time, as the frames would store it.
 
         Args:
             time_us: By the clock of the frames.
-            late_us: By how much the events' clock is late.
+            belief: In what the events say.
         """
         exposure = self.frames.exposure
         away = np.maximum(
             exposure.open_us[self.order] - time_us, time_us - exposure.close_us[self.order]
         )
         away = np.maximum(away, 0)
-        nearest = np.argsort(away, kind="stable")[:2]
+        nearest = [int(i) for i in np.argsort(away, kind="stable")[:2]]
         if away[nearest[0]] == 0 or len(nearest) == 1:
-            return self._developed(self._log_light(int(self.order[nearest[0]]), time_us, late_us))
-        one, other = (self._log_light(int(self.order[i]), time_us, late_us) for i in nearest)
+            return self._developed(self._log_light(int(self.order[nearest[0]]), time_us, belief))
+        one, other = (self._log_light(int(self.order[i]), time_us, belief) for i in nearest)
         share = float(away[nearest[1]] / away[nearest].sum())
         return self._developed(share * one + (1 - share) * other)
 
     def _developed(self, log_light: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
         return self.tone.encode(log_light.exp().clamp(0, 1))
 
-    def _log_light(self, frame: int, time_us: int, late_us: int) -> Float[Tensor, "h w c"]:
+    def _log_light(self, frame: int, time_us: int, belief: Belief) -> Float[Tensor, "h w c"]:
         """What one exposure and the events from its opening to a time say."""
         opens = int(self.frames.exposure.open_us[frame])
-        first, last = min(opens, time_us) + late_us, max(opens, time_us) + late_us
+        first, last = min(opens, time_us) + belief.late_us, max(opens, time_us) + belief.late_us
         negative, positive = counts_between(self.motion, first, last)
-        change = negative * self.thresholds[0] + positive * self.thresholds[1]
+        change = negative * belief.negative + positive * belief.positive
         stored = torch.from_numpy(self.frames.images[frame].astype(np.float32)) / self.frames.white
         blurred = self.tone.decode(stored).clamp_min(FLOOR).log()
-        return blurred - self.log_mean[frame].float() + (change if time_us >= opens else -change)
+        return blurred - self._log_mean(frame, belief) + (change if time_us >= opens else -change)
+
+    def _log_mean(self, frame: int, belief: Belief) -> Float[Tensor, "h w c"]:
+        """Of one exposure, relative to its opening; kept for the belief that was asked last."""
+        if (frame, belief) not in self._log_means:
+            for known in [key for key in self._log_means if key[0] == frame]:
+                del self._log_means[known]
+            window = tuple(t + belief.late_us for t in self.frames.exposure.window(frame))
+            thresholds = FixedThresholds(belief.negative, belief.positive)
+            path = self.motion.path(
+                (window[0], window[1]), np.array(window[:1], np.int64), thresholds
+            )
+            self._log_means[frame, belief] = path.log_mean.half()
+        return self._log_means[frame, belief].float()

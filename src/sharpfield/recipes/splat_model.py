@@ -87,7 +87,7 @@ class SplatModel(nn.Module):
         self.path = self.capture.trajectory
         self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
         self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
-        self.looks = Looks(self.options, self.capture, self.unknowns.guess, seed)
+        self.looks = Looks(self.options, self.capture, seed)
         self.scene = SplatScene(
             recipe.gaussians,
             self.capture,
@@ -108,18 +108,18 @@ class SplatModel(nn.Module):
 
     def draw(self, step: int) -> Batch:
         """One instant in early steps; in late ones an exposure, or a stretch of events."""
-        late_us = round(self.unknowns.offset_us)
+        belief = self.unknowns.belief()
         if step < self.late_from:
-            batch = self.looks.instant(step, late_us)
+            batch = self.looks.instant(step, belief)
         elif self.capture.frames is None:
             batch = self.looks.stretch(step)
         elif self.unknowns.offset_steps is None or self.looks.motion is None:
-            batch = self.looks.exposure(step, events=True)
+            batch = self.looks.exposure(step, events=True, belief=belief)
         # Views of the frames' instants cannot tell when events really happened.
         elif step % 2:
             batch = self.looks.stretch(step)
         else:
-            batch = self.looks.exposure(step, events=False, late_us=late_us)
+            batch = self.looks.exposure(step, events=False, belief=belief)
         device = self.scene.gaussians.means.device
         return {name: seen.to(device) for name, seen in batch.items()}
 
@@ -158,17 +158,22 @@ class SplatModel(nn.Module):
         ).mean()
 
     def _look_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
-        """Squared error of the change of log light; silent pixels may change by a threshold."""
+        """Squared error of the number of events; silent pixels may change by a threshold.
+
+        In units of events, as their number is what was measured and what is rounded: the error
+        that makes learned thresholds those under which the events are likeliest.
+        """
         first, pairs = events[0].reshape(-1), events.reshape(-1)
         colours = events.shape[-1]  # 1, or 3 behind a colour filter
         rgb = light.rgb.flatten(0, 1).repeat_interleave(colours, 0)  # [h w c, k, rgb]
         log = self.unknowns.response(rgb, first)[..., 0]
         change = (log[:, 1:] - log[:, :-1]).T.reshape(-1)
         negative, positive = self.unknowns.thresholds(pairs)
-        error = (change - pairs.measured(negative, positive)).square()
+        threshold = torch.where(change > 0, positive, negative)
+        error = ((change - pairs.measured(negative, positive)) / threshold).square()
+        beyond = torch.relu(change.abs() / threshold - 1).square()
         silent = (pairs.negative == 0) & (pairs.positive == 0)
-        beyond = torch.relu(change - positive) + torch.relu(-change - negative)
-        return torch.where(silent, beyond.square(), error).mean()
+        return torch.where(silent, beyond, error).mean()
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""

@@ -157,7 +157,7 @@ class EventSplat(Splat):
 
     paper: ClassVar[Paper] = XIONG
 
-    looks: LookOptions = field(default_factory=lambda: LookOptions(sharp=0.0, windows=1.0))
+    looks: LookOptions = field(default_factory=lambda: LookOptions(sharp=0.0, windows=0.04))
 
     def build(self, capture: Capture, seed: int) -> SplatModel:
         """On the events alone, whatever else there is."""

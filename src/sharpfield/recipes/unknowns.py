@@ -3,6 +3,7 @@
 Each is fixed at what the capture says, or learned from there together with the scene.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,6 +17,7 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.core.schedule import Group, Schedule, constant
 from sharpfield.core.seed import generator
 from sharpfield.formation.response import FixedResponse, LogResidual, Response
+from sharpfield.formation.sharp_instants import Belief
 from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
 from sharpfield.geometry import LearnedKnots, LearnedShake
 from sharpfield.recipes.event_term import thresholds_of
@@ -94,6 +96,20 @@ class Unknowns(nn.Module):
         negative, positive = (self.thresholds.log_guess + self.thresholds.log_factor).exp().tolist()
         return negative, positive
 
+    def belief(self) -> Belief:
+        """What is believed of the event camera now, in steps too small to matter.
+
+        In steps, so that pictures made from it need not be made anew at every step.
+        """
+        negative, positive = (
+            math.exp(round(math.log(c) / THRESHOLD_STEP) * THRESHOLD_STEP)
+            for c in self.both_thresholds()
+        )
+        late = round(self.offset_us / OFFSET_STEP_US) * OFFSET_STEP_US
+        if isinstance(self.thresholds, FixedThresholds):
+            negative, positive = self.guess
+        return Belief(negative, positive, late)
+
     def on_time(self, time: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """When what events report really happened, both 0...1 of the capture."""
         if self.offset_steps is None:
@@ -120,6 +136,11 @@ class Unknowns(nn.Module):
 
 
 OFFSET_UNIT_US = 1000.0
+"""The offset is learned in this unit, so that one rate suits it."""
+
+OFFSET_STEP_US, THRESHOLD_STEP = 50, 0.01
+"""Of a belief, in us and in natural log."""
+
 FLOOR = 1e-4
 """Linear light added before the logarithm of what events see."""
 
