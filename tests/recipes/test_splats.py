@@ -1,0 +1,241 @@
+"""The five recipes on Gaussians: all learn, from whatever there is, and resume alike."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sharpfield.core import Camera, Capture, CaptureError, Growing, Model, OptionError, Rays
+from sharpfield.geometry import Still
+from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes.looks import LookOptions
+from sharpfield.recipes.splat_model import SplatModel
+from sharpfield.recipes.splat_scene import GaussianOptions
+from sharpfield.recipes.unknowns import UnknownOptions
+from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
+from sharpfield.simulation import EventSensor, Rig, Timing, simulate
+from sharpfield.training import Options, adam, file_of, fit, train
+from tests.training.toy import quiet
+
+NAMES = ("splat", "edi-splat", "blur-splat", "event-splat", "ev-splat")
+STEPS = 24
+
+
+@functools.cache
+def recorded(bayer: str = "") -> Capture:
+    """32x24 pixels, six frames of which two are held out."""
+    timing = Timing(frames=6, exposure_us=20_000, interval_us=24_000, test_every=4)
+    rig = Rig(
+        size=(32, 24), event_sensor=EventSensor(threshold_on=0.1, threshold_off=0.1, bayer=bayer)
+    )
+    return simulate("tiles", rig=rig, timing=timing, seed=3)
+
+
+def photos() -> Capture:
+    """Blurry photos without events, each from a place of its own, whose motion nobody knows."""
+    capture = recorded().without(events=True)
+    frames = capture.needed_frames
+    poses = capture.frame_pose(np.arange(len(frames))).double().numpy()
+    middle = frames.exposure.middle_us
+    return replace(
+        capture,
+        trajectory=Still(poses),
+        frames=replace(
+            frames,
+            track=np.arange(len(frames)),
+            exposure=type(frames.exposure)(middle, middle),
+        ),
+        notes={"motion": "unknown"},
+    )
+
+
+def small(name: str, **changes: Any) -> Any:
+    """A recipe at a size for tests."""
+    recipe = replace(recipe_named(name)(), steps=STEPS, **changes)
+    gaussians = replace(recipe.gaussians, budget=600, start=0.5, grow_every=7)
+    return replace(recipe, gaussians=changes.get("gaussians", gaussians))
+
+
+def learned(model: SplatModel) -> tuple[float, float]:
+    """The loss of the last steps' looks, before and after training."""
+    probe = [(step, model.draw(step)) for step in range(STEPS - 4, STEPS)]
+
+    @torch.no_grad()
+    def loss() -> float:
+        return sum(float(sum(model.losses(batch, step).values())) for step, batch in probe)
+
+    before = loss()
+    fit(model, adam(model), steps=range(STEPS))
+    return before, loss()
+
+
+CASES = {
+    **{f"{name}, both": (name, recorded) for name in NAMES},
+    "blur-splat, frames": ("blur-splat", lambda: recorded().without(events=True)),
+    "blur-splat, photos": ("blur-splat", photos),
+    "splat, photos": ("splat", photos),
+    "ev-splat, frames": ("ev-splat", lambda: recorded().without(events=True)),
+    "ev-splat, events": ("ev-splat", lambda: recorded().without(frames=True)),
+    "event-splat, events": ("event-splat", lambda: recorded().without(frames=True)),
+    "ev-splat, colour": ("ev-splat", lambda: recorded("RGGB")),
+    "edi-splat, colour": ("edi-splat", lambda: recorded("RGGB")),
+    "event-splat, colour": ("event-splat", lambda: recorded("RGGB").without(frames=True)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_recipe_learns_from_whatever_there_is(case: str) -> None:
+    name, capture = CASES[case]
+    before, after = learned(small(name).build(capture(), 0))
+    assert after < 0.8 * before
+
+
+@pytest.mark.parametrize("growth", ["markov", "classic", "none"])
+def test_every_way_of_growing_learns(growth: str) -> None:
+    gaussians = GaussianOptions(budget=600, start=0.5, growth=growth, grow_every=5)
+    model = small("splat", gaussians=gaussians).build(recorded(), 0)
+    begun = len(model.scene.gaussians)
+    before, after = learned(model)
+    assert after < 0.8 * before
+    count = len(model.scene.gaussians)
+    assert count == begun if growth == "none" else begun < count <= 600
+
+
+def test_everything_unknown_is_learned_at_once() -> None:
+    unknowns = UnknownOptions(
+        threshold=(0.12, 0.12), thresholds="pixels", response="residual",
+        gains=True, knots=6, offset=True,
+    )  # fmt: skip
+    model = small("ev-splat", unknowns=unknowns).build(recorded(), 0)
+    before, after = learned(model)
+    assert after < 0.8 * before
+    assert model.unknowns.offset_us != 0
+    for name, parameter in (*model.unknowns.named_parameters(), *model.path.named_parameters()):
+        assert torch.isfinite(parameter).all() and parameter.any(), name
+
+
+def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> None:
+    model = small("ev-splat", looks=LookOptions(early=0.5, instants=3)).build(recorded(), 0)
+    assert model.late_from == model.heaviest_step == STEPS // 2
+    early, late = model.draw(STEPS // 2 - 1), model.draw(STEPS // 2)
+    assert set(early) == {"look", "sharp"} and len(early["look"].time[0]) == 1
+    assert set(late) == {"look", "frames", "sharp", "events"} and len(late["look"].time[0]) == 4
+    terms = model.losses(late, STEPS // 2)
+    assert set(terms) == {"blur", "sharp", "events", "idle"}
+
+
+def test_the_baselines_differ_in_what_they_believe_of_the_frames() -> None:
+    plain, edi, blur = (small(name).build(recorded(), 0) for name in NAMES[:3])
+    one, other = (model.draw(0)["frames"] for model in (plain, edi))
+    assert torch.equal(one.frame, other.frame) and not torch.equal(one.value, other.value)
+    assert plain.draw(0)["look"].shape == edi.draw(0)["look"].shape == (1, 1)
+    assert blur.draw(0)["look"].shape[1] > 1 and "events" not in blur.draw(0)
+
+
+def test_event_splat_never_looks_at_frames() -> None:
+    both, alone = (
+        small("event-splat").build(capture, 0)
+        for capture in (recorded(), recorded().without(frames=True))
+    )
+    assert set(both.draw(0)) == {"look", "events"}
+    assert torch.equal(both.scene.gaussians.means, alone.scene.gaussians.means)
+
+
+def test_it_is_a_model_that_grows_and_draws_views() -> None:
+    model = small("ev-splat").build(recorded(), 0)
+    assert isinstance(model, Model) and isinstance(model, Growing)
+    assert isinstance(model, ViewRenderer) and renderer_of(model) is model
+    pose = model.capture.frame_pose(np.array([0]))[0]
+    seen = render_view(renderer_of(model), model.capture.camera, pose, 0.5)
+    shown = model.develop(seen.rgb)
+    assert shown.shape == (24, 32, 3) and shown.min() >= 0 and shown.max() <= 1
+
+
+def test_scattered_rays_are_refused() -> None:
+    model, rows = small("splat").build(recorded(), 0), torch.zeros(5, 3)
+    with pytest.raises(OptionError) as refused:
+        model.render(Rays(rows, rows, rows[:, 0], rows[:, 0]))
+    assert str(refused.value) == (
+        "OptionError: a scene of Gaussians draws whole views, not scattered rays\n"
+        "  got    5 rays\n"
+        "  do     call draw_views"
+    )
+
+
+def test_a_distorted_lens_is_refused() -> None:
+    camera = recorded().camera
+    bent = Camera(32, 24, camera.fx_px, camera.fy_px, 16.0, 12.0, "fisheye", (0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(OptionError) as refused:
+        small("splat").build(replace(recorded(), camera=bent), 0)
+    assert "lenses without distortion" in str(refused.value)
+    assert "got    a fisheye lens" in str(refused.value)
+    assert "undistort frames and events first" in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "message"),
+    [
+        ("splat", "frames", "nothing is left to learn from"),
+        ("blur-splat", "frames", "nothing is left to learn from"),
+        ("edi-splat", "frames", "this needs frames"),
+        ("edi-splat", "events", "this needs events"),
+        ("event-splat", "events", "this needs events"),
+    ],
+)
+def test_what_a_recipe_needs_is_said(name: str, missing: str, message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        small(name).build(recorded().without(**{missing: True}), 0)
+
+
+def test_the_recipes_are_listed_and_described() -> None:
+    for name in NAMES:
+        recipe = RECIPES[name]
+        assert recipe.__doc__ and recipe.paper.bibtex.startswith("@")
+        assert recipe().lasting(9).steps == 9
+    assert len({RECIPES[name].__doc__ for name in NAMES}) == len(NAMES)
+
+
+def test_a_step_depends_on_seed_and_step_alone() -> None:
+    recipe = small("ev-splat", unknowns=UnknownOptions(gains=True, knots=4))
+    first, second = recipe.build(recorded(), 5), recipe.build(recorded(), 5)
+    first.losses(first.draw(3), 3)  # what was looked at before does not matter
+    for step in (2, 20):
+        one, other = (model.losses(model.draw(step), step) for model in (first, second))
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize(
+    ("name", "growth", "source"),
+    [
+        ("ev-splat", "markov", recorded),
+        ("splat", "classic", recorded),
+        ("blur-splat", "markov", photos),
+    ],
+)
+def test_resuming_equals_never_having_stopped(
+    tmp_path: Path, name: str, growth: str, source: Any
+) -> None:
+    gaussians = GaussianOptions(budget=600, start=0.5, growth=growth, grow_every=4)
+    unknowns = UnknownOptions(thresholds="signs", gains=True, knots=4, offset=name == "ev-splat")
+    recipe, stop_at = small(name, gaussians=gaussians, unknowns=unknowns), 18
+
+    class Dying(SplatModel):
+        def draw(self, step: int) -> Any:
+            if step == stop_at:
+                raise KeyboardInterrupt
+            return super().draw(step)
+
+    def go(folder: str, build: Any, *, resume: bool = False) -> bytes:
+        options = Options(checkpoint_every=5, resume=resume)
+        train(build, tmp_path / folder, options, steps=STEPS, settings={}, console=quiet())
+        return file_of(tmp_path / folder, "last").read_bytes()
+
+    straight = go("straight", lambda steps: recipe.build(source(), 1))
+    with pytest.raises(KeyboardInterrupt):
+        go("stopped", lambda steps: Dying(recipe, source(), 1))
+    assert go("stopped", lambda steps: recipe.build(source(), 1), resume=True) == straight
