@@ -16,6 +16,7 @@ from sharpfield.simulation import EventSensor, Rig, Timing, motion, scene, simul
 from sharpfield.simulation.simulate import view
 
 THRESHOLD = 0.04
+BELIEF = Belief(THRESHOLD, THRESHOLD)
 SENSOR = EventSensor(threshold_on=THRESHOLD, threshold_off=THRESHOLD)
 TIMING = Timing(frames=4, exposure_us=40_000, interval_us=60_000, step_us=500, test_every=0)
 SEED = 1
@@ -90,12 +91,23 @@ def test_half_way_both_neighbours_count_alike() -> None:
 
 
 @pytest.mark.parametrize("late_us", [3_000, -5_000])
-def test_a_late_clock_of_the_events_is_undone(late_us: int) -> None:
-    capture, t_us = recorded(), opens(1) + 10_000
+@pytest.mark.parametrize("after", [10_000, 50_000])
+def test_a_late_clock_of_the_events_is_undone(late_us: int, after: int) -> None:
+    capture, t_us = recorded(), opens(1) + after
     events = capture.needed_events
-    late = replace(capture, events=replace(events, t_us=events.t_us + late_us))
-    torch.testing.assert_close(at(instants(late), t_us, late_us), at(instants(capture), t_us))
-    assert off(at(instants(late), t_us), at(instants(capture), t_us)) > 1e-3
+    late = instants(replace(capture, events=replace(events, t_us=events.t_us + late_us)))
+    wanted = instants(capture).at(t_us, BELIEF)
+    torch.testing.assert_close(late.at(t_us, replace(BELIEF, late_us=late_us)), wanted)
+    assert off(late.at(t_us, BELIEF), wanted) > 1e-3
+
+
+def test_what_was_believed_before_does_not_matter() -> None:
+    made, t_us = instants(recorded()), opens(1) + 10_000
+    first = made.at(t_us, BELIEF)
+    other = made.at(t_us, Belief(0.06, 0.02))
+    assert off(other, truth(t_us)) > 1.5 * off(first, truth(t_us))
+    assert torch.equal(made.at(t_us, BELIEF), first)
+    assert torch.equal(instants(recorded()).at(t_us, Belief(0.06, 0.02)), other)
 
 
 def test_pictures_are_asked_for_between_the_first_and_the_last_exposure() -> None:

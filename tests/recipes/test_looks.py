@@ -9,11 +9,12 @@ import torch
 
 from sharpfield.core import Capture, CaptureError, EventPairs, Instants, Pixels
 from sharpfield.core.measurements import Batch
+from sharpfield.formation.sharp_instants import Belief
 from sharpfield.ops.event_index import build
 from sharpfield.recipes.looks import LookOptions, Looks
 from sharpfield.simulation import EventSensor, Rig, Timing, simulate
 
-THRESHOLDS = (0.2, 0.2)
+BELIEF = Belief(0.2, 0.2)
 
 
 @functools.cache
@@ -24,7 +25,7 @@ def coloured(bayer: str = "RGGB") -> Capture:
 
 
 def looks(capture: Capture, seed: int = 0, **options) -> Looks:
-    return Looks(LookOptions(**options), capture, THRESHOLDS, seed)
+    return Looks(LookOptions(**options), capture, seed)
 
 
 def of(batch: Batch) -> tuple[Instants, EventPairs | None]:
@@ -47,7 +48,7 @@ def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Captur
     made = looks(tiny, instants=instants)
     begin, end = (tiny.clock.unit(int(t)).item() for t in tiny.needed_events.t_us[[0, -1]])
     for step in range(12):
-        batch = made.exposure(step, events=True)
+        batch = made.exposure(step, events=True, belief=BELIEF)
         look, _ = of(batch)
         frames = batch["frames"]
         assert isinstance(frames, Pixels) and look.shape == (1, instants + 1)
@@ -64,7 +65,7 @@ def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Captur
 def test_each_instant_has_a_share_of_the_exposure_of_its_own(tiny: Capture):
     made = looks(tiny, instants=4)
     for step in range(8):
-        batch = made.exposure(step, events=False)
+        batch = made.exposure(step, events=False, belief=BELIEF)
         look, frames = batch["look"], batch["frames"]
         assert isinstance(look, Instants) and isinstance(frames, Pixels)
         opens, closes = frames.open.unique(), frames.close.unique()
@@ -76,14 +77,17 @@ def test_every_frame_is_looked_at_once_before_any_twice(tiny: Capture):
     made, train = looks(tiny), tiny.split.train.tolist()
     for epoch in (0, 3):
         steps = range(epoch * len(train), (epoch + 1) * len(train))
-        seen = [int(made.exposure(s, events=False)["frames"].frame.unique()) for s in steps]
+        seen = [
+            int(made.exposure(s, events=False, belief=BELIEF)["frames"].frame.unique())
+            for s in steps
+        ]
         assert sorted(seen) == train
 
 
 def test_frames_are_as_stored(tiny: Capture):
     made, frames = looks(tiny, blur="none", windows=0.0, sharp=0.0), tiny.needed_frames
     for step in range(4):
-        batch = made.exposure(step, events=True)
+        batch = made.exposure(step, events=True, belief=BELIEF)
         look, seen = batch["look"], batch["frames"]
         assert set(batch) == {"look", "frames"} and isinstance(seen, Pixels)
         frame = int(seen.frame[0, 0, 0])
@@ -98,7 +102,7 @@ def test_frames_are_as_stored(tiny: Capture):
 def test_windows_hold_the_events_that_the_index_counts(tiny: Capture):
     index = build(tiny.needed_events)
     made = looks(tiny)
-    for batch in (made.exposure(3, events=True), made.stretch(5)):
+    for batch in (made.exposure(3, events=True, belief=BELIEF), made.stretch(5)):
         look, events = of(batch)
         assert events is not None and events.shape == (1, look.shape[1] - 1, 16, 16, 1)
         t_us = tiny.clock.us(look.time[0].double().numpy())
@@ -115,7 +119,7 @@ def test_windows_hold_the_events_that_the_index_counts(tiny: Capture):
 
 
 def test_windows_follow_each_other_from_instant_to_instant(tiny: Capture):
-    look, events = of(looks(tiny, instants=4).exposure(2, events=True))
+    look, events = of(looks(tiny, instants=4).exposure(2, events=True, belief=BELIEF))
     assert events is not None
     assert torch.equal(events.start[0, :, 0, 0, 0], look.time[0, :-1])
     assert torch.equal(events.end[0, :, 0, 0, 0], look.time[0, 1:])
@@ -141,12 +145,12 @@ def test_single_instants_come_from_the_whole_capture(tiny: Capture):
     closes = tiny.clock.unit(int(exposure.close_us[train].max()))
     times = []
     for step in range(20):
-        batch = made.instant(step, 0)
+        batch = made.instant(step, BELIEF)
         look, sharp = batch["look"], batch["sharp"]
         assert isinstance(look, Instants) and isinstance(sharp, Pixels)
         assert sharp.shape == (1, 16, 16, 1) and look.weight.tolist() == [[1.0]]
         assert sharp.open.unique() == look.time
-        wanted = made.sharp.at(int(tiny.clock.us(look.time.double().numpy())[0, 0]))
+        wanted = made.sharp.at(int(tiny.clock.us(look.time.double().numpy())[0, 0]), BELIEF)
         torch.testing.assert_close(sharp.value[0, :, :, 0], wanted, atol=2e-3, rtol=0)
         times.append(float(look.time))
     assert opens <= min(times) and max(times) <= closes and max(times) - min(times) > 0.6
@@ -159,7 +163,7 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
     corners = set()
     for step in range(12):
         for name in ("frames", "sharp", "events"):
-            found = cut.exposure(step, events=True)
+            found = cut.exposure(step, events=True, belief=BELIEF)
             look, seen = found["look"], found[name]
             assert isinstance(look, Instants) and look.size == (side, side)
             left, top = look.corner[0, 0].tolist()
@@ -174,12 +178,19 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
                 torch.testing.assert_close(seen.value[0], wanted)
     assert len(corners) > 5 if side < 16 else corners == {(0, 0)}
     if side == 16:
-        assert same(whole.exposure(3, events=True), cut.exposure(3, events=True))
+        assert same(
+            whole.exposure(3, events=True, belief=BELIEF),
+            cut.exposure(3, events=True, belief=BELIEF),
+        )
 
 
 def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
     def drawn(made: Looks, step: int) -> list[Batch]:
-        return [made.instant(step, 0), made.exposure(step, events=True), made.stretch(step)]
+        return [
+            made.instant(step, BELIEF),
+            made.exposure(step, events=True, belief=BELIEF),
+            made.stretch(step),
+        ]
 
     first, again, other = looks(tiny, 7), looks(tiny, 7), looks(tiny, 8)
     drawn(again, 1)  # what was looked at before does not matter
@@ -191,21 +202,24 @@ def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
 
 def test_behind_a_colour_filter_every_pixel_has_three_measurements():
     made = looks(coloured(), instants=2)
-    _, events = of(made.exposure(1, events=True))
+    _, events = of(made.exposure(1, events=True, belief=BELIEF))
     assert events is not None and events.shape == (1, 2, 12, 16, 3)
     assert events.channel is not None and events.channel[0, 1, 5, 6].tolist() == [0, 1, 2]
     moved = events.positive - events.negative
     seen = [float(moved[..., colour].sum()) for colour in range(3)]
     assert len(set(seen)) == 3, "each colour has events of its own"
-    sharp = made.instant(0, 0)["sharp"]
+    sharp = made.instant(0, BELIEF)["sharp"]
     assert isinstance(sharp, Pixels) and sharp.value.shape == (1, 12, 16, 1, 3)
 
 
-def test_a_late_clock_moves_the_sharp_pictures(tiny: Capture):
+def test_sharp_pictures_follow_what_is_believed(tiny: Capture):
     made = looks(tiny)
-    on_time, late = (made.instant(4, us)["sharp"] for us in (0, 5_000))
-    assert isinstance(on_time, Pixels) and isinstance(late, Pixels)
-    assert torch.equal(on_time.open, late.open) and not torch.equal(on_time.value, late.value)
+    usual, *others = (
+        made.instant(4, belief)["sharp"]
+        for belief in (BELIEF, Belief(0.2, 0.2, 5_000), Belief(0.3, 0.3), BELIEF)
+    )
+    assert [torch.equal(usual.value, other.value) for other in others] == [False, False, True]
+    assert all(torch.equal(usual.open, other.open) for other in others)
 
 
 def test_photos_of_unknown_motion_have_no_sharp_pictures(tiny: Capture):
@@ -215,7 +229,9 @@ def test_photos_of_unknown_motion_have_no_sharp_pictures(tiny: Capture):
 
 def test_a_frame_of_no_length_is_one_view(tiny: Capture):
     sharp = replace(tiny, split=replace(tiny.split, train=tiny.split.test, test=tiny.split.train))
-    batch = looks(sharp, instants=5, windows=0.0, sharp=0.0).exposure(0, events=False)
+    batch = looks(sharp, instants=5, windows=0.0, sharp=0.0).exposure(
+        0, events=False, belief=BELIEF
+    )
     assert batch["look"].shape == (1, 1)
 
 

@@ -44,7 +44,10 @@ def total(terms: dict[str, Tensor]) -> Tensor:
 
 
 def batches(made: SplatModel) -> list[Batch]:
-    return [made.looks.exposure(2, events=True), made.looks.stretch(3)]
+    return [
+        made.looks.exposure(2, events=True, belief=made.unknowns.belief()),
+        made.looks.stretch(3),
+    ]
 
 
 def test_at_first_what_is_learned_does_nothing(tiny: Capture):
@@ -148,7 +151,7 @@ def test_knots_go_back_to_where_the_camera_was(tiny: Capture):
         moved[axis] = 0.02
         with torch.no_grad():
             made.path.twist += moved
-        batch = blurred(truth, made.looks.exposure(1, events=False))
+        batch = blurred(truth, made.looks.exposure(1, events=False, belief=made.unknowns.belief()))
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], made.path.twist)[0]
         assert slope.sum((0, 1))[axis] > 0, "going down the slope undoes the move"
 
@@ -168,7 +171,9 @@ def test_a_brighter_exposure_asks_for_a_larger_gain(tiny: Capture):
     gains = made.unknowns.log_gain
     assert gains is not None and len(gains) == len(tiny.needed_frames)
     for factor, sign in ((1.2, 1), (0.8, -1)):
-        batch = blurred(truth, made.looks.exposure(1, events=False), gain=factor)
+        batch = blurred(
+            truth, made.looks.exposure(1, events=False, belief=made.unknowns.belief()), gain=factor
+        )
         frame = int(batch["frames"].frame[0, 0, 0])
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], gains)[0]
         assert slope[frame] * sign < 0 and (slope != 0).sum() == 1
