@@ -88,6 +88,13 @@ def test_similarities_move_points_with_cameras():
     torch.testing.assert_close(after, 0.4 * before)  # the same directions, all else scaled
 
 
+def test_a_similarity_can_be_undone():
+    change = Similarity(0.4, poses(1)[0, :, :3].numpy(), np.array([1.0, 2, -3]))
+    world, seen = points(30).numpy(), poses(30, stream="seen").numpy()
+    np.testing.assert_allclose(change.inverse().points(change.points(world)), world, atol=1e-12)
+    np.testing.assert_allclose(change.inverse().poses(change.poses(seen)), seen, atol=1e-12)
+
+
 def test_normalisation_puts_the_average_camera_at_the_origin():
     seen = poses(12, turn=0.5).numpy()
     change = normalisation(seen, near=2.0)

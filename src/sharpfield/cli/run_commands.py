@@ -137,7 +137,7 @@ def render(
     opened = open_run(run, capture=capture, device=device)
     model = opened.model
     where = device_named(device)
-    camera_moves = camera_path(model.capture, path, pictures=pictures)
+    camera_moves = camera_path(opened.seen, path, pictures=pictures)
 
     def rendered(number: int) -> np.ndarray:
         pose = torch.from_numpy(camera_moves.poses[number]).to(where)

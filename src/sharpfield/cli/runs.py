@@ -1,7 +1,7 @@
 """A run from the command line's point of view: start one, open one again, measure it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,6 +65,14 @@ class Opened:
     model: Any
     capture: Capture
     """All of it, also what the model did not use."""
+
+    @property
+    def seen(self) -> Capture:
+        """The capture in the model's world, also with frames that the model did not use."""
+        own: Capture = self.model.capture
+        if own.frames is not None:
+            return own
+        return replace(own, frames=self.capture.frames, split=self.capture.split)
 
 
 def device_named(name: str) -> str:

@@ -45,6 +45,11 @@ class Similarity:
         centre = self.points(poses[..., 3])
         return np.concatenate([self.rotation @ poses[..., :3], centre[..., None]], -1)
 
+    def inverse(self) -> "Similarity":
+        """The change back."""
+        back = self.rotation.T / self.scale
+        return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
+
 
 def average_pose(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
     """A camera at the mean position that looks along the mean direction."""

@@ -85,7 +85,8 @@ class SplatModel(nn.Module):
         else:
             self.capture = with_learned_poses(self.capture, recipe.unknowns)
         self.path = self.capture.trajectory
-        self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
+        self.encoding = capture.frames.encoding if capture.frames else "gamma2.2"
+        self.tone = tone_of(self.encoding)
         self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
         self.looks = Looks(self.options, self.capture, seed)
         self.scene = SplatScene(
