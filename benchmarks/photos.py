@@ -1,0 +1,76 @@
+"""Blurred photos of unknown motion, and sharp ones to compare with: `blur-splat` on real scenes.
+
+    python -m benchmarks.photos SCENE [--minutes 10] [--shrink 2] [--recipes blur-splat splat]
+
+SCENE is a folder of Deblur-NeRF's layout. Held-out views are measured from the poses that structure
+from motion gave them, and again after those were refined on the finished model, as the papers do
+whose own poses move while they learn.
+"""
+
+import argparse
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.table import Row, save, show
+from sharpfield.captures import native, read
+from sharpfield.captures.shrunk import shrunk
+from sharpfield.cli.runs import open_run, start
+from sharpfield.evaluation import Measuring, evaluate
+from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.saved import Started
+from sharpfield.training import Options
+
+REFINED = Refinement(steps=200, rate=5e-4, every=50)
+
+
+def main() -> None:
+    """Run, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--shrink", type=int, default=2)
+    parser.add_argument("--recipes", nargs="+", default=["splat", "blur-splat"])
+    parser.add_argument("--out", type=Path, default=Path("runs/photos"))
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    capture = shrunk(read(asked.scene), asked.shrink)
+    folder = asked.out / "capture"
+    native.write(capture, folder)
+    rows: list[Row] = []
+    for name in asked.recipes:
+        run = asked.out / name
+        recipe = prepared(
+            name, recipe_named(name)(), "draft", capture=native.read(folder), device="cpu"
+        )
+        started = Started(name, recipe, str(folder.resolve()), asked.seed)
+        options = Options(minutes=asked.minutes)
+        start(started, native.read(folder), run, options, device="cpu", console=Console())
+        rows.append(_row(name, run))
+    show(rows)
+    facts = {"scene": asked.scene.name, "minutes": asked.minutes, "shrink": asked.shrink}
+    print(save(f"photos_{asked.scene.name}", rows, {k: str(v) for k, v in facts.items()}))
+
+
+def _row(name: str, run: Path) -> Row:
+    opened = open_run(run, capture=None, device="cpu")
+    before = evaluate(opened.model, opened.capture, run)
+    begin = aligned_poses(opened.model, opened.capture)
+    found = refine_poses(opened.model, opened.capture, how=REFINED, start=begin)
+    how = Measuring(poses=found.poses, stated=found.protocol)
+    after = evaluate(opened.model, opened.capture, run, measuring=how)
+    return {
+        "recipe": name,
+        "psnr": before["mean"]["psnr"],
+        "ssim": before["mean"]["ssim"],
+        "psnr, refined poses": after["mean"]["psnr"],
+        "ssim, refined poses": after["mean"]["ssim"],
+        "steps": after["train"]["steps"],
+        "seconds": after["train"]["seconds"],
+    }
+
+
+if __name__ == "__main__":
+    main()
