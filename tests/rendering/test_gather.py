@@ -137,6 +137,30 @@ def test_colours_left_out_in_evaluation_do_not_show(how: Compositing, chunk: int
         torch.testing.assert_close(getattr(seen, name), getattr(full, name).detach())
 
 
+def test_training_asks_for_the_colour_of_lit_points_only(monkeypatch):
+    """A density that is not positive has no colour to show and nothing to learn."""
+    monkeypatch.setattr(module, "ROUND", 8)
+    network, given = head(), work(noisy=True)
+    asked: list[int] = []
+    colour = network.colour
+    monkeypatch.setattr(
+        network, "colour", lambda feature, seen: asked.append(len(feature)) or colour(feature, seen)
+    )
+    found = gather(network, given, HOWS["frustum"])
+    lit = int((found.weights > module.SPECK).sum())
+    assert lit <= sum(asked) < lit + 8 < 0.9 * RAYS * SAMPLES
+
+
+def test_what_is_not_lit_is_empty():
+    made = generator(0, 0, "lit")
+    network, given = head(), work(ordered=True)
+    lit = torch.rand(RAYS, SAMPLES, generator=made) > 0.5
+    with torch.no_grad():
+        found = gather(network, dataclasses.replace(given, lit=lit), HOWS["cleared"])
+        full = gather(network, given, HOWS["cleared"])
+    assert full.weights[~lit].any() and not found.weights[~lit].any() and found.weights[lit].any()
+
+
 @pytest.mark.parametrize("seeing", [torch.no_grad, torch.enable_grad])
 def test_an_opaque_end_stops_all_light(seeing):
     with seeing():

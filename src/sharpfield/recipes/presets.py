@@ -124,7 +124,7 @@ def paper(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
         fine=whole.fine,
         octaves=whole.octaves,
         samples=whole.samples,
-        precision=whole.precision,
+        precision="auto",
     )
     return replace(recipe.lasting(30_000), rate=5e-3, volume=volume)
 

@@ -6,7 +6,8 @@ density_j delta_j is
 
     e_j T_j g_j - e_j / (e_j + 1e-10) sum_{k > j} g_k w_k.
 
-Only `e` and the weights are kept for it; plain torch keeps six arrays of that size.
+Only `e` and the weights are kept for it; plain torch keeps six arrays of that size. One thread walks
+over the rays: they come in pieces that are done before another one is awake.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.composite import LEAK, weigh
-from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.fast._kernel import kernel, memory
 
 
 @weigh.accelerate("cpu", needs="numba")
@@ -36,7 +37,7 @@ class _Weigh(torch.autograd.Function):
         if opaque_end:
             clear[..., -1] = 0
         weights = torch.empty_like(clear)
-        spread(_forward, _rows(clear), _rows(weights))
+        _forward(_rows(clear), _rows(weights))
         ctx.save_for_backward(density, delta, clear, weights)
         return weights
 
@@ -48,7 +49,7 @@ class _Weigh(torch.autograd.Function):
         density, delta, clear, weights = ctx.saved_tensors
         of_depth = torch.empty_like(clear)
         arrived = gradients[0].contiguous()
-        spread(_backward, _rows(clear), _rows(weights), _rows(arrived), _rows(of_depth))
+        _backward(_rows(clear), _rows(weights), _rows(arrived), _rows(of_depth))
         return (
             of_depth * delta if ctx.needs_input_grad[0] else None,
             of_depth * density if ctx.needs_input_grad[1] else None,
@@ -62,9 +63,9 @@ def _rows(values: Tensor) -> Any:
 
 @kernel
 @no_type_check
-def _forward(worker, workers, clear, weights):
+def _forward(clear, weights):
     leak = clear.dtype.type(LEAK)
-    for i in range(*share(worker, workers, clear.shape[0])):
+    for i in range(clear.shape[0]):
         passed = clear.dtype.type(1)
         for j in range(clear.shape[1]):
             weights[i, j] = (1 - clear[i, j]) * passed
@@ -73,9 +74,9 @@ def _forward(worker, workers, clear, weights):
 
 @kernel
 @no_type_check
-def _backward(worker, workers, clear, weights, gradient, of_depth):
+def _backward(clear, weights, gradient, of_depth):
     leak = clear.dtype.type(LEAK)
-    for i in range(*share(worker, workers, clear.shape[0])):
+    for i in range(clear.shape[0]):
         behind = clear.dtype.type(0)
         for j in range(clear.shape[1] - 1, -1, -1):  # sums from the far end lose no digits
             of_depth[i, j] = -behind * clear[i, j] / (clear[i, j] + leak)

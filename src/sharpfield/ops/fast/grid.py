@@ -74,7 +74,10 @@ class _Lookup(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         points, basis, *grids = ctx.saved_tensors
         needs_points, needs_basis, *needs_grids = ctx.needs_input_grad
-        grad, volume = gradients[0].contiguous(), _volume(grids)
+        # Empty points get no gradient, and in a scene that stands most points are empty.
+        learning = gradients[0].any(1).nonzero()[:, 0]
+        grad, volume = gradients[0][learning], _volume(grids)
+        every, points = points, points[learning]
         of_grids = _zero_gradients(volume) if any(needs_grids) else None
         of_points = torch.zeros_like(points) if needs_points else None
         of_basis = torch.zeros_like(basis) if needs_basis else None
@@ -90,6 +93,8 @@ class _Lookup(torch.autograd.Function):
                 spread(kernels.scatter, taps, volume, of_grids, memory(arrived))
             if of_points is not None:
                 spread(kernels.slope, taps, volume, memory(arrived), memory(of_points[rows]))
+        if of_points is not None:
+            of_points = torch.zeros_like(every).index_copy(0, learning, of_points)
         return of_points, of_basis, *(_tensors(of_grids) if of_grids else [None] * len(grids))
 
 
