@@ -1,11 +1,11 @@
 # pyright: basic
-"""Gaussians drawn on the CPU, in tiles.
+"""Gaussians drawn in tiles: on the CPU by kernels of our own, on CUDA by those of gsplat.
 
-Every Gaussian is projected into all views and listed in the tiles that its splat can reach; one
-entry of such a list is a *touch*. A tile's touches are blended from front to back, a row of pixels
-at a time. On the way back each touch writes its own gradient, and each Gaussian adds up those of
-its touches in a fixed order: no two threads ever write to the same place, and the sums do not
-depend on how many there are.
+On the CPU every Gaussian is projected into all views and listed in the tiles that its splat can
+reach; one entry of such a list is a *touch*. A tile's touches are blended from front to back, a row
+of pixels at a time. On the way back each touch writes its own gradient, and each Gaussian adds up
+those of its touches in a fixed order: no two threads ever write to the same place, and the sums do
+not depend on how many there are.
 """
 
 from typing import Any
@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sharpfield.core.extras import need
 from sharpfield.ops.fast._kernel import memory, spread
 from sharpfield.ops.fast._splat_blend import LANES, TILE, blend, blend_back
 from sharpfield.ops.fast._splat_project import (
@@ -25,7 +26,7 @@ from sharpfield.ops.fast._splat_project import (
     project,
     project_back,
 )
-from sharpfield.ops.rasterize import Canvas, Drawn, rasterize
+from sharpfield.ops.rasterize import NEAR, WIDEN, Canvas, Drawn, rasterize
 
 
 @rasterize.accelerate("cpu", needs="numba")
@@ -45,6 +46,57 @@ def _(
     if shift is None:
         shift = means.new_zeros(()).expand(len(poses), len(means), 2)
     return Drawn(*_Rasterize.apply(canvas, shift, *(tensor.contiguous() for tensor in tensors)))
+
+
+@rasterize.accelerate("cuda", needs="gsplat")
+def _(
+    means: Float[Tensor, "n 3"],
+    quaternions: Float[Tensor, "n 4"],
+    scales: Float[Tensor, "n 3"],
+    opacities: Float[Tensor, "n"],
+    colours: Float[Tensor, "v n c"],
+    poses: Float[Tensor, "v 3 4"],
+    canvas: Canvas,
+    shift: Float[Tensor, "v n 2"] | None = None,
+) -> Drawn:
+    tensors = (means, quaternions, scales, opacities, colours, poses)
+    if not len(means) or any(tensor.dtype != torch.float32 for tensor in tensors):
+        return rasterize.reference(*tensors, canvas, shift)
+    gsplat = need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
+    camera, (width, height) = canvas.camera, canvas.size
+    # All of the image is projected into, so that slopes end where those of the definition do.
+    reach, centre, depth, conic, thinned = gsplat.fully_fused_projection(
+        means, None, quaternions, scales, *_as_matrices(poses, canvas), camera.width, camera.height,
+        eps2d=WIDEN, near_plane=NEAR, calc_compensations=canvas.antialiased,
+        opacities=opacities.detach(),
+    )  # fmt: skip
+    centre = centre - canvas.corner.to(centre)[:, None]
+    if shift is not None:
+        centre = centre + shift
+    opacity = opacities.expand(len(poses), -1)
+    if canvas.antialiased:
+        opacity = opacity * thinned
+    tiles = -(-width // TILE), -(-height // TILE)
+    _, crossings, order = gsplat.isect_tiles(centre, reach, depth, TILE, *tiles)
+    begins = gsplat.isect_offset_encode(crossings, len(poses), *tiles)
+    features = torch.cat([colours, depth[..., None]], -1)
+    sums, stopped = gsplat.rasterize_to_pixels(
+        centre, conic, features, opacity.contiguous(), width, height, TILE, begins, order
+    )
+    return Drawn(sums[..., :-1], sums[..., -1], stopped[..., 0])
+
+
+def _as_matrices(
+    poses: Float[Tensor, "v 3 4"], canvas: Canvas
+) -> tuple[Float[Tensor, "v 4 4"], Float[Tensor, "v 3 3"]]:
+    """Camera-from-world, and the lens."""
+    inward = poses[:, :, :3].mT
+    last = poses.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(poses), 1, 4)
+    camera_from_world = torch.cat([inward, -inward @ poses[:, :, 3:]], -1)
+    camera = canvas.camera
+    lens = [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]]
+    matrix = poses.new_tensor(lens).expand(len(poses), 3, 3)
+    return torch.cat([camera_from_world, last], 1), matrix
 
 
 class _Rasterize(torch.autograd.Function):
