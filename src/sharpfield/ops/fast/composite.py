@@ -6,8 +6,8 @@ density_j delta_j is
 
     e_j T_j g_j - e_j / (e_j + 1e-10) sum_{k > j} g_k w_k.
 
-Only `e` and the weights are kept for it; plain torch keeps six arrays of that size. One thread walks
-over the rays: they come in pieces that are done before another one is awake.
+Only `e` and the weights are kept for it; plain torch keeps six arrays of that size. A single thread
+walks over the rays: they come in pieces that are done before another one is awake.
 """
 
 from collections.abc import Callable
