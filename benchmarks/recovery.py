@@ -93,6 +93,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=6.0)
     parser.add_argument("--size", default="160x104")
     parser.add_argument("--out", type=Path, default=Path("runs/recovery"))
+    parser.add_argument("--only", nargs="*", default=["believed", "refined"])
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     console = Console()
@@ -101,7 +102,8 @@ def main() -> None:
     native.write(truth, asked.out / "truth")
     native.write(capture, asked.out / "capture")
     rows = []
-    for name, preset in (("believed", "draft"), ("refined", "refine,draft")):
+    presets = {"believed": "draft", "refined": "refine,draft"}
+    for name, preset in ((name, presets[name]) for name in asked.only):
         run = asked.out / name
         recipe = prepared(
             "ev-splat", recipe_named("ev-splat")(), preset, capture=capture, device="cpu"

@@ -45,11 +45,14 @@ class EventPairs(Struct):
     """First instant, 0...1 of the capture."""
     end: Float[Tensor, "*b"]
     negative: Float[Tensor, "*b"]
-    """Minus the number of events to darker: 0, -1, ..."""
+    """Minus the number of events to darker: 0, -1, ...; parts of one where the phase is known."""
     positive: Float[Tensor, "*b"]
     """Number of events to brighter."""
     channel: Int64[Tensor, "*b"] | None = None
     """Colour filter of the pixel: 0 red, 1 green, 2 blue. None on a mono sensor."""
+    slack: Float[Tensor, "*b"] | None = None
+    """By how many events the counts may be off because they are whole. None for pairs that begin
+    and end with an event, where they are exact."""
 
     def measured(
         self, threshold_negative: Tensor | float, threshold_positive: Tensor | float

@@ -14,14 +14,19 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
+from sharpfield.captures import event_index
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.seed import number, numpy_generator
 from sharpfield.formation.event_counts import counts_between
 from sharpfield.formation.event_motion import EventMotion
+from sharpfield.formation.event_phase import phase_at
 from sharpfield.formation.sharp_instants import Belief, SharpInstants
 from sharpfield.ops.permutation import shuffled
+
+ROUNDED = 0.5
+"""Events that a count may be off by at an end where the phase of the pixel is unknown."""
 
 Times = Int64[np.ndarray, "_"]
 
@@ -94,6 +99,10 @@ class Looks:
         self.motion = self.sharp = None
         if events is not None and (frames is None or options.windows > 0 or options.sharp > 0):
             self.motion = EventMotion.of(capture)
+        self.index = None
+        if self.motion is not None and self.motion.channel is None:
+            events = self.motion.events
+            self.index = None if events.rectified else event_index(events)
         known = capture.notes.get("motion") != "unknown"
         if self.motion is not None and frames is not None and options.sharp > 0 and known:
             self.sharp = SharpInstants(capture, self.motion)
@@ -243,6 +252,15 @@ class Looks:
         ]
         negative = torch.stack([part.of(darker) for darker, _ in counted])[None]
         positive = torch.stack([part.of(brighter) for _, brighter in counted])[None]
+        slack = ((negative == 0) & (positive == 0)).float()
+        if self.index is not None:
+            size = {"width": self.motion.events.width, "height": self.motion.events.height}
+            found = [phase_at(self.index, int(time), **size) for time in times]
+            phase = torch.stack([part.of(phase) for phase, _ in found])[None, ..., None]
+            unknown = torch.stack([~part.of(known) for _, known in found])[None, ..., None]
+            negative = negative + phase[:, 1:].clamp_max(0) - phase[:, :-1].clamp_max(0)
+            positive = positive + phase[:, 1:].clamp_min(0) - phase[:, :-1].clamp_min(0)
+            slack = ROUNDED * (unknown[:, 1:].float() + unknown[:, :-1].float())
         shape = negative.shape
         time = torch.from_numpy(self.capture.clock.unit(times)).float()[:, None, None, None]
         xy = part.of(self.capture.camera.grid())[:, :, None]
@@ -254,4 +272,5 @@ class Looks:
             negative=negative,
             positive=positive,
             channel=torch.arange(3).expand(shape) if shape[-1] == 3 else None,
+            slack=slack,
         )

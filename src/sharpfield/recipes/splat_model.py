@@ -8,13 +8,14 @@ it, with the events counted between each two that follow each other.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.growth import Growth
@@ -159,7 +160,7 @@ class SplatModel(nn.Module):
         ).mean()
 
     def _look_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
-        """Squared error of the number of events; silent pixels may change by a threshold.
+        """Squared error of the number of events, beyond what their rounding allows.
 
         In units of events, as their number is what was measured and what is rounded: the error
         that makes learned thresholds those under which the events are likeliest.
@@ -171,14 +172,17 @@ class SplatModel(nn.Module):
         change = (log[:, 1:] - log[:, :-1]).T.reshape(-1)
         negative, positive = self.unknowns.thresholds(pairs)
         threshold = torch.where(change > 0, positive, negative)
-        error = ((change - pairs.measured(negative, positive)) / threshold).square()
-        beyond = torch.relu(change.abs() / threshold - 1).square()
-        silent = (pairs.negative == 0) & (pairs.positive == 0)
-        return torch.where(silent, beyond, error).mean()
+        off = (change - pairs.measured(negative, positive)).abs() / threshold
+        slack = 0.0 if pairs.slack is None else pairs.slack
+        return torch.relu(off - slack).square().mean()
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
         return self.scene.draw(views)
+
+    def through(self, camera: Camera) -> "OtherLens":
+        """The same scene, seen by another camera than the capture's."""
+        return OtherLens(self.scene, camera)
 
     def render(self, rays: Rays) -> Radiance:
         """Not possible: Gaussians are drawn as whole views.
@@ -209,6 +213,18 @@ class SplatModel(nn.Module):
             *self.unknowns.groups(),
             *pose_groups(self.capture, falling),
         ]
+
+
+@dataclass(frozen=True)
+class OtherLens:
+    """A scene of Gaussians in front of a camera that did not record it."""
+
+    scene: SplatScene
+    camera: Camera
+
+    def draw_views(self, views: Views) -> Radiance:
+        """Sharp linear light of whole views."""
+        return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
 
 
 def _motion_unknown(capture: Capture) -> bool:
