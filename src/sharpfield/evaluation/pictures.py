@@ -40,7 +40,17 @@ def event_picture(events: EventStream, start_us: int, end_us: int) -> Colours:
     sign = np.asarray(part.p, np.float64)[:, None]
     total = splat_nearest(xy, sign, width=events.width, height=events.height)
     busy = np.abs(total[total != 0])
-    strength = np.clip(total / (np.percentile(busy, FULL) if len(busy) else 1), -1, 1)
+    return colour_signs(total[..., 0], np.percentile(busy, FULL) if len(busy) else 1.0)
+
+
+def colour_signs(total: Shaped[np.ndarray, "h w"], full: float) -> Colours:
+    """Sums of signs on white, red for positive and blue for negative ones.
+
+    Args:
+        total: At each pixel.
+        full: The sum that gets the full colour.
+    """
+    strength = np.clip(total / full, -1, 1)[..., None]
     colour = np.where(strength > 0, np.array(RED), np.array(BLUE))
     mixed = np.array(WHITE) + np.abs(strength) * (colour - np.array(WHITE))
     return mixed.round().astype(np.uint8)

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
+from sharpfield.geometry.shake import LearnedShake
 from sharpfield.geometry.space import Similarity, normalisation
-from sharpfield.geometry.trajectory import Moved, Stamped, Tracks, count_tracks
+from sharpfield.geometry.trajectory import LearnedKnots, Moved, Stamped, Tracks, count_tracks
 
 REFERENCE = "reference_poses"
 """Note of a capture that says which poses its normalisation is taken over."""
@@ -61,3 +62,17 @@ def moved(capture: Capture, change: Similarity) -> Capture:
         frames=frames,
         points=None if capture.points is None else change.points(capture.points),
     )
+
+
+def change_of(capture: Capture) -> Similarity:
+    """The change of world that a normalised capture went through; of any other, none.
+
+    It brings what is known in the world of the capture on disk, a camera's path for instance, to
+    where a model lives.
+    """
+    path: object = capture.trajectory
+    while isinstance(path, LearnedKnots | LearnedShake):
+        path = path.base
+    if isinstance(path, Moved):
+        return path.change
+    return Similarity(1.0, np.eye(3), np.zeros(3))

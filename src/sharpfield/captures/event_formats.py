@@ -1,0 +1,87 @@
+"""Writing events in the format that a file's name asks for, in as many pieces as you like.
+
+    .h5     our own, see `captures.event_writer`: it says its units and its sensor
+    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and width, height
+    .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
+
+Whatever the format, the file appears whole, at the end, or not at all.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from sharpfield.captures.arrays import write_arrays
+from sharpfield.captures.event_writer import writing_events
+from sharpfield.core.errors import OptionError
+from sharpfield.core.events import EventStream
+from sharpfield.core.files import replacing
+
+Append = Callable[[EventStream], None]
+"""Takes events that come after all earlier ones."""
+
+
+@contextmanager
+def exporting_events(path: Path, like: EventStream) -> Iterator[Append]:
+    """What takes the events of a new file.
+
+    Args:
+        path: Ends in .h5, .npz or .csv.
+        like: Any stream of the same sensor, it may be empty.
+
+    Raises:
+        OptionError: The name has another ending.
+    """
+    expect_format(path)
+    with FORMATS[path.suffix](path, like) as append:
+        yield append
+
+
+def expect_format(path: Path) -> None:
+    """Make sure that events can be written to a file of this name.
+
+    Raises:
+        OptionError: They cannot.
+    """
+    if path.suffix not in FORMATS:
+        raise OptionError(
+            "unknown format of events", got=path, do=f"name a file with {', '.join(FORMATS)}"
+        )
+
+
+@contextmanager
+def _native(path: Path, like: EventStream) -> Iterator[Append]:
+    with writing_events(path, like) as writer:
+        yield writer.append
+
+
+@contextmanager
+def _arrays(path: Path, like: EventStream) -> Iterator[Append]:
+    parts = [like[:0]]
+    yield parts.append
+    columns = {
+        "x": np.concatenate([part.x for part in parts]),
+        "y": np.concatenate([part.y for part in parts]),
+        "t": np.concatenate([part.t_us for part in parts]),
+        "p": np.concatenate([part.p for part in parts]),
+    }
+    size = {"width": np.array(like.width), "height": np.array(like.height)}
+    with replacing(path) as temporary:
+        write_arrays(temporary, columns | size)
+
+
+@contextmanager
+def _text(path: Path, like: EventStream) -> Iterator[Append]:
+    with replacing(path) as temporary, temporary.open("w") as file:
+        file.write("t_us,x,y,p\n")
+
+        def append(events: EventStream) -> None:
+            rows = np.stack([events.t_us, events.x, events.y, events.p], -1)
+            np.savetxt(file, rows, "%d", delimiter=",")
+
+        yield append
+
+
+FORMATS = {".h5": _native, ".npz": _arrays, ".csv": _text}
