@@ -148,7 +148,11 @@ def nerf_paper(recipe: NeRF) -> NeRF:
 def refine(recipe: Splat) -> Splat:
     """Thresholds, poses and the clocks' offset are learned, too."""
     unknowns = replace(recipe.unknowns, thresholds="signs", knots=REFINED_KNOTS, offset=True)
-    return replace(recipe, unknowns=unknowns)
+    looks = recipe.looks
+    if looks.sharp > 0:
+        # Sharp pictures are made with the thresholds that are believed, and would confirm them.
+        looks = replace(looks, early=0.3, sharp=0.01, windows=0.01)
+    return replace(recipe, looks=looks, unknowns=unknowns)
 
 
 def splat_draft(recipe: Splat) -> Splat:
