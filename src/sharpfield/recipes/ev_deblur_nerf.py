@@ -58,7 +58,7 @@ PAPER = Paper(
         "Frames look from the trajectory at mid-exposure unless their own pose is more than a pixel"
         " off; the released code always takes their own.",
         "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light,"
-        " and the fine network where the coarse one saw less than 1e-3 of it.",
+        " and the fine network where the coarse one saw less than that.",
     ),
 )
 

@@ -15,10 +15,7 @@ from sharpfield.core.radiance import Radiance, Samples
 from sharpfield.core.rays import Rays
 from sharpfield.geometry.space import Space
 from sharpfield.ops import stepfun
-from sharpfield.rendering.gather import Compositing, Work, gather
-
-EMPTY = 1e-3
-"""In evaluation, old points are taken as empty where the coarse stage saw less light than this."""
+from sharpfield.rendering.gather import UNSEEN, Compositing, Work, gather
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ class CoarseToFine:
         one of its neighbours; and at the last point, which may be opaque to it alone.
         """
         most = nn.functional.pad(weights, (1, 1)).unfold(-1, 3, 1).amax(-1)
-        return nn.functional.pad(most[:, :-1] > EMPTY, (0, 1 + self.samples[1]), value=True)
+        return nn.functional.pad(most[:, :-1] > UNSEEN, (0, 1 + self.samples[1]), value=True)
 
     def _coarse_depths(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "b s"]:
         even = torch.linspace(self.space.near, self.space.far, self.samples[0], device=rays.device)
