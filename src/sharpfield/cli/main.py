@@ -7,6 +7,7 @@ import tyro
 
 from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
+from sharpfield.cli.event_commands import events
 from sharpfield.cli.export_command import export
 from sharpfield.cli.recipe_commands import recipes
 from sharpfield.cli.run_commands import evaluate, render, train
@@ -21,6 +22,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "train": train,
     "evaluate": evaluate,
     "render": render,
+    "events": events,
     "export": export,
     "recipes": recipes,
 }

@@ -140,6 +140,7 @@ def _nearest_us(
 def _keys(events: EventStream, start_us: int, span: int) -> Int64[np.ndarray, "n"]:
     """A number for each event that orders by pixel, then sign, then time."""
     x, y = (
-        np.floor(np.asarray(c, np.float64) + 0.5).astype(np.int64) for c in (events.x, events.y)
+        np.clip(np.floor(np.asarray(place, np.float64) + 0.5), 0, size - 1).astype(np.int64)
+        for place, size in ((events.x, events.width), (events.y, events.height))
     )
     return ((y * events.width + x) * 2 + (events.p > 0)) * span + (events.t_us - start_us)
