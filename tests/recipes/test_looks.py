@@ -9,8 +9,8 @@ import torch
 
 from sharpfield.core import Capture, CaptureError, EventPairs, Instants, Pixels
 from sharpfield.core.measurements import Batch
+from sharpfield.formation.event_phase import LONGEST_US
 from sharpfield.formation.sharp_instants import Belief
-from sharpfield.ops.event_index import build
 from sharpfield.recipes.looks import LookOptions, Looks
 from sharpfield.simulation import EventSensor, Rig, Timing, simulate
 
@@ -22,6 +22,14 @@ def coloured(bayer: str = "RGGB") -> Capture:
     timing = Timing(frames=4, exposure_us=20_000, interval_us=24_000, test_every=4)
     rig = Rig(size=(16, 12), event_sensor=EventSensor(bayer=bayer))
     return simulate("tiles", rig=rig, timing=timing, seed=3)
+
+
+@functools.cache
+def busy() -> Capture:
+    """On a mono sensor whose pixels report often."""
+    timing = Timing(frames=4, exposure_us=20_000, interval_us=24_000, test_every=4)
+    rig = Rig(size=(16, 12), event_sensor=EventSensor(threshold_on=0.02, threshold_off=0.02))
+    return simulate("garden", rig=rig, timing=timing, seed=3)
 
 
 def looks(capture: Capture, seed: int = 0, **options) -> Looks:
@@ -99,23 +107,45 @@ def test_frames_are_as_stored(tiny: Capture):
         assert look.time.item() == pytest.approx(float(middle), abs=1e-6)
 
 
-def test_windows_hold_the_events_that_the_index_counts(tiny: Capture):
-    index = build(tiny.needed_events)
-    made = looks(tiny)
+def phase(capture: Capture, x: int, y: int, t_us: int) -> float | None:
+    """The part of an event that a pixel saw since its last one; None where nobody knows."""
+    whole = capture.needed_events
+    here = (whole.x == x) & (whole.y == y)
+    before, after = (
+        np.flatnonzero(here & (whole.t_us <= t_us)),
+        np.flatnonzero(here & (whole.t_us > t_us)),
+    )
+    if not len(before) or not len(after):
+        return None
+    last, following = before[-1], after[0]
+    gap = whole.t_us[following] - whole.t_us[last]
+    if whole.p[last] != whole.p[following] or gap > LONGEST_US:
+        return None
+    return float(whole.p[last] * (t_us - whole.t_us[last]) / gap)
+
+
+def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
+    capture, known = busy(), 0
+    made, whole = looks(capture), capture.needed_events
     for batch in (made.exposure(3, events=True, belief=BELIEF), made.stretch(5)):
         look, events = of(batch)
-        assert events is not None and events.shape == (1, look.shape[1] - 1, 16, 16, 1)
-        t_us = tiny.clock.us(look.time[0].double().numpy())
-        whole = made.motion.events
+        assert events is not None and events.shape == (1, look.shape[1] - 1, 12, 16, 1)
+        t_us = capture.clock.us(look.time[0].double().numpy())
         for w, (start, end) in enumerate(zip(t_us[:-1], t_us[1:], strict=True)):
-            first, last = np.searchsorted(whole.t_us, (start, end), side="right")
-            assert events[0, w].positive.sum() == (whole.p[first:last] > 0).sum()
-            assert events[0, w].negative.sum() == -(whole.p[first:last] < 0).sum()
-            site = np.flatnonzero((index.site_xy == (7, 4)).all(1))
-            pixel = events[0, w, 4, 7, 0]
-            at = (whole.x == 7) & (whole.y == 4) & (whole.t_us > start) & (whole.t_us <= end)
-            assert len(site) == 1 and pixel.positive - pixel.negative == at.sum()
-            assert pixel.xy.tolist() == [7.5, 4.5]
+            for x, y in ((7, 4), (3, 9), (12, 2), (9, 6)):
+                pixel = events[0, w, y, x, 0]
+                here = (whole.x == x) & (whole.y == y)
+                p = whole.p[here & (whole.t_us > start) & (whole.t_us <= end)]
+                ends = [phase(capture, x, y, int(t)) for t in (start, end)]
+                known += sum(part is not None for part in ends)
+                parts = [part or 0.0 for part in ends]
+                brighter = (p > 0).sum() + max(parts[1], 0) - max(parts[0], 0)
+                darker = -(p < 0).sum() + min(parts[1], 0) - min(parts[0], 0)
+                assert pixel.positive.item() == pytest.approx(brighter, abs=1e-3)
+                assert pixel.negative.item() == pytest.approx(darker, abs=1e-3)
+                assert pixel.slack == 0.5 * ends.count(None)
+                assert pixel.xy.tolist() == [x + 0.5, y + 0.5]
+    assert known > 5
 
 
 def test_windows_follow_each_other_from_instant_to_instant(tiny: Capture):
@@ -159,17 +189,21 @@ def test_single_instants_come_from_the_whole_capture(tiny: Capture):
 @pytest.mark.parametrize("part", [5, 16, 99])
 def test_parts_cut_everything_alike(tiny: Capture, part: int):
     side = min(part, 16)
-    whole, cut = looks(tiny, instants=2), looks(tiny, instants=2, part=part)
+    alone, cut = looks(tiny, part=part, sharp=0.0), looks(tiny, part=part)
     corners = set()
     for step in range(12):
-        for name in ("frames", "sharp", "events"):
-            found = cut.exposure(step, events=True, belief=BELIEF)
+        for name, made in (("frames", alone), ("sharp", cut), ("events", cut)):
+            found = made.exposure(step, events=True, belief=BELIEF)
             look, seen = found["look"], found[name]
             assert isinstance(look, Instants) and look.size == (side, side)
             left, top = look.corner[0, 0].tolist()
             corners.add((left, top))
-            xy = seen.xy.reshape(-1, *seen.xy.shape[-4 if name != "frames" else -3 :])[0]
-            xy = xy if name == "frames" else xy[:, :, 0]
+            xy = {
+                "frames": seen.xy[0],
+                "sharp": seen.xy[0, :, :, 1],
+                "events": seen.xy[0, 1, ..., 0, :],
+            }[name]
+            assert xy.shape[:2] == (side, side)
             assert xy[0, 0].tolist() == [left + 0.5, top + 0.5]
             assert xy[-1, -1].tolist() == [left + side - 0.5, top + side - 0.5]
             if name == "frames":
@@ -178,10 +212,8 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
                 torch.testing.assert_close(seen.value[0], wanted)
     assert len(corners) > 5 if side < 16 else corners == {(0, 0)}
     if side == 16:
-        assert same(
-            whole.exposure(3, events=True, belief=BELIEF),
-            cut.exposure(3, events=True, belief=BELIEF),
-        )
+        whole = looks(tiny).exposure(3, events=True, belief=BELIEF)
+        assert same(whole, cut.exposure(3, events=True, belief=BELIEF))
 
 
 def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):

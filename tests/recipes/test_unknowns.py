@@ -126,7 +126,8 @@ def slope_of(
     log = truth.unknowns.response(rgb, events[0, 0].reshape(-1))[..., 0]
     change = (log[:, 1:] - log[:, :-1]).T.reshape(events.shape)
     negative, positive = change.clamp(max=0) / 0.3, change.clamp(min=0) / 0.1
-    batch["events"] = replace(events, negative=negative, positive=positive)
+    exact = torch.zeros_like(positive)
+    batch["events"] = replace(events, negative=negative, positive=positive, slack=exact)
     return torch.autograd.grad(made.losses(batch, step)["events"], learned)[0]
 
 

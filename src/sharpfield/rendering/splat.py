@@ -23,8 +23,15 @@ from sharpfield.ops.rasterize import Canvas, rasterize
 class Cloud(Protocol):
     """Gaussians, as `fields.Gaussians` holds them."""
 
-    means: Tensor
-    quaternions: Tensor
+    @property
+    def means(self) -> Float[Tensor, "n 3"]:
+        """Their centres."""
+        ...
+
+    @property
+    def quaternions(self) -> Float[Tensor, "n 4"]:
+        """Their rotations, w x y z."""
+        ...
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
