@@ -6,12 +6,12 @@ counted at every pixel between two instants that follow each other. A look at a 
 costs less.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from sharpfield.captures import event_index
@@ -82,12 +82,7 @@ class Looks:
         seed: Of the run.
     """
 
-    def __init__(
-        self,
-        options: LookOptions,
-        capture: Capture,
-        seed: int,
-    ) -> None:
+    def __init__(self, options: LookOptions, capture: Capture, seed: int) -> None:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
         if frames is None and options.windows == 0 or events is None and frames is None:
@@ -136,10 +131,25 @@ class Looks:
             "frames": self._frame_pixels(frame, part),
         }
         if self.sharp is not None:
-            batch["sharp"] = self._sharp(times, frame, part, belief)
+            sharp = batch["sharp"] = self._sharp(times, frame, part, belief)
+            batch["frames"] = replace(batch["frames"], value=self._as_sampled(sharp.value, weight))
         if windows:
             batch["events"] = self._windows(times, part)
         return batch
+
+    def _as_sampled(
+        self, stored: Float[Tensor, "m h w k c"], weight: np.ndarray
+    ) -> Float[Tensor, "m h w c"]:
+        """The blurred frame as so few instants would have averaged it.
+
+        A mean of a few views is not the mean over the exposure. If it had to equal the blurred
+        frame whatever the instants, a scene that is itself a little blurred would do best. The
+        sharp pictures at the same instants are the frame times how its light moved, so that their
+        mean is the frame but for that difference, in colours that are the frame's own.
+        """
+        assert self.sharp is not None
+        light = self.sharp.tone.decode(stored) * torch.from_numpy(weight).float()[:, None]
+        return self.sharp.tone.encode(light.sum(-2))
 
     def stretch(self, step: int) -> Batch:
         """A stretch of events of any length, cut into windows."""

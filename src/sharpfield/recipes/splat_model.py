@@ -42,6 +42,10 @@ from sharpfield.recipes.unknowns import (
 Terms = dict[str, Tensor]
 
 
+BLOCK = 8
+"""Pixels to each side of the blocks over which thresholds are learned."""
+
+
 @runtime_checkable
 class SplatNumbers(Protocol):
     """The numbers of a splat recipe."""
@@ -162,19 +166,25 @@ class SplatModel(nn.Module):
     def _look_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
         """Squared error of the number of events, beyond what their rounding allows.
 
-        In units of events, as their number is what was measured and what is rounded: the error
-        that makes learned thresholds those under which the events are likeliest.
+        In units of events, as their number is what was measured and what is rounded. Learned
+        thresholds have an error of their own, see `_coarse`.
         """
         first, pairs = events[0].reshape(-1), events.reshape(-1)
         colours = events.shape[-1]  # 1, or 3 behind a colour filter
         rgb = light.rgb.flatten(0, 1).repeat_interleave(colours, 0)  # [h w c, k, rgb]
         log = self.unknowns.response(rgb, first)[..., 0]
         change = (log[:, 1:] - log[:, :-1]).T.reshape(-1)
-        negative, positive = self.unknowns.thresholds(pairs)
+        both = self.unknowns.thresholds(pairs)
+        negative, positive = (threshold.detach() for threshold in both)
         threshold = torch.where(change > 0, positive, negative)
         off = (change - pairs.measured(negative, positive)).abs() / threshold
         slack = 0.0 if pairs.slack is None else pairs.slack
-        return torch.relu(off - slack).square().mean()
+        error = torch.relu(off - slack).square().mean()
+        if self.unknowns.learns_thresholds:
+            exact = torch.zeros_like(change) if pairs.slack is None else pairs.slack
+            residual = (change.detach() - pairs.measured(*both)) * (exact == 0)
+            error = error + _coarse(residual.reshape(events.shape)).square().mean()
+        return error
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
@@ -225,6 +235,15 @@ class OtherLens:
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
         return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
+
+
+def _coarse(image: Float[Tensor, "q h w c"]) -> Float[Tensor, "q c y x"]:
+    """Means over blocks of pixels.
+
+    What thresholds are learned from: coarse structure is held by the frames, so that its contrast
+    is right, while fine structure is told by events alone, and would agree with any threshold.
+    """
+    return nn.functional.avg_pool2d(image.movedim(-1, 1), BLOCK, ceil_mode=True)
 
 
 def _motion_unknown(capture: Capture) -> bool:

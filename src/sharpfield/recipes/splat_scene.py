@@ -157,7 +157,7 @@ class SplatScene(nn.Module):
         made = generator(self.seed, step, "growth", own.means.device)
         if options.noise > 0:
             with torch.no_grad():
-                own.means += wander(own, self.means_rate(step), made, noise=options.noise)
+                own.means.add_(wander(own, self.means_rate(step), made, noise=options.noise))
         if not self._round(step):
             return []
         growth = share_out(own.log_scales, own.opacity_logits, budget=self.budget, generator=made)

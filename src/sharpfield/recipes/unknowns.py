@@ -89,6 +89,11 @@ class Unknowns(nn.Module):
             return 0.0
         return float(self.offset_steps.detach()) * OFFSET_UNIT_US
 
+    @property
+    def learns_thresholds(self) -> bool:
+        """Whether thresholds are learned."""
+        return isinstance(self.thresholds, LearnedThresholds)
+
     def both_thresholds(self) -> tuple[float, float]:
         """The thresholds to darker and to brighter, without what single pixels differ by."""
         if isinstance(self.thresholds, FixedThresholds):
