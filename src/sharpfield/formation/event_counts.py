@@ -35,7 +35,7 @@ def counts_between(
         counts = np.zeros((2, events.height, events.width, 1), np.float32)
         part = slice(int(first), int(last))
         _count(events.x[part], events.y[part], events.p[part], counts)
-        return torch.from_numpy(-counts[0]), torch.from_numpy(counts[1])
+        return torch.as_tensor(-counts[0]), torch.as_tensor(counts[1])
     window, channel = (start_us, end_us), motion.channel
     negative, positive = (
         change_between(events, window, only, motion.spread, channel=channel)

@@ -41,7 +41,7 @@ def phase_at(
     known = np.zeros(index.sites, np.bool_)
     _phases(index.offset, index.t_us, index.p, time_us, LONGEST_US, phase, known)
     shape = height, width
-    return torch.from_numpy(phase.reshape(shape)), torch.from_numpy(known.reshape(shape))
+    return torch.as_tensor(phase.reshape(shape)), torch.as_tensor(known.reshape(shape))
 
 
 @njit(cache=True, nogil=True)

@@ -79,7 +79,7 @@ class SharpInstants:
         first, last = min(opens, time_us) + belief.late_us, max(opens, time_us) + belief.late_us
         negative, positive = counts_between(self.motion, first, last)
         change = negative * belief.negative + positive * belief.positive
-        stored = torch.from_numpy(self.frames.images[frame].astype(np.float32)) / self.frames.white
+        stored = torch.as_tensor(self.frames.images[frame].astype(np.float32)) / self.frames.white
         blurred = self.tone.decode(stored).clamp_min(FLOOR).log()
         return blurred - self._log_mean(frame, belief) + (change if time_us >= opens else -change)
 

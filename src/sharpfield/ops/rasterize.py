@@ -147,14 +147,14 @@ def project(
     spread = slope @ inward[:, None] @ axes  # [v n 2 3]
     covariance = spread @ spread.mT
     widened = covariance + WIDEN * torch.eye(2).to(covariance)
-    determinant = torch.linalg.det(widened)
+    determinant = widened.det()
     conic = torch.stack(
         [widened[..., 1, 1], -widened[..., 0, 1], widened[..., 0, 0]], -1
     ) / determinant.unsqueeze(-1)
     opacity = opacities.expand_as(determinant)
     if canvas.antialiased:
         # The floor keeps the root's slope finite for splats seen edge-on.
-        before = torch.linalg.det(covariance).clamp_min(1e-6)
+        before = covariance.det().clamp_min(1e-6)
         opacity = opacity * (before / determinant).sqrt()
     return Splats(centre, conic, seen[..., 2], torch.where(in_front, opacity, 0.0))
 
