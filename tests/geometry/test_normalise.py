@@ -5,8 +5,24 @@ import pytest
 import torch
 
 from sharpfield.core import Camera, Capture, Clock, EventStream, Exposure, Frames
-from sharpfield.geometry import BSpline, Moved, Stamped, Still, Tracks, count_tracks, se3
-from sharpfield.geometry.normalise import PATH_SAMPLES, moved, normalised, reference_poses
+from sharpfield.geometry import (
+    BSpline,
+    LearnedKnots,
+    LearnedShake,
+    Moved,
+    Stamped,
+    Still,
+    Tracks,
+    count_tracks,
+    se3,
+)
+from sharpfield.geometry.normalise import (
+    PATH_SAMPLES,
+    change_of,
+    moved,
+    normalised,
+    reference_poses,
+)
 from sharpfield.geometry.space import Similarity, average_pose
 from tests.geometry.toy import points, poses
 
@@ -122,3 +138,23 @@ def test_tracks_are_counted():
     change = Similarity(2.0, np.eye(3), np.zeros(3))
     counts = [count_tracks(one) for one in (path, still, both, Moved(both, change))]
     assert counts == [1, 4, 6, 6]
+
+
+@pytest.mark.parametrize(
+    "learned",
+    [
+        lambda path: path,
+        lambda path: LearnedKnots(path, knots=4),
+        lambda path: LearnedShake(path, torch.zeros(1), torch.ones(1), knots=4),
+    ],
+    ids=["known", "corrected", "shaken"],
+)
+def test_the_change_of_world_is_known_also_under_what_is_learned(learned):
+    there, change = normalised(capture())
+    there = dataclasses.replace(there, trajectory=learned(there.trajectory))
+    assert change_of(there) is change
+
+
+def test_a_capture_as_read_went_through_no_change():
+    some = points(7).numpy()
+    np.testing.assert_array_equal(change_of(capture()).points(some), some)

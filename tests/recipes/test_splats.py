@@ -239,3 +239,16 @@ def test_resuming_equals_never_having_stopped(
     with pytest.raises(KeyboardInterrupt):
         go("stopped", lambda steps: Dying(recipe, source(), 1))
     assert go("stopped", lambda steps: recipe.build(source(), 1), resume=True) == straight
+
+
+def test_a_scene_can_be_seen_through_another_lens() -> None:
+    model = small("splat").build(recorded(), 0)
+    camera, pose = model.capture.camera, model.capture.frame_pose(np.array([2]))[0]
+    own = render_view(renderer_of(model), camera, pose, 0.5)
+    same = render_view(model.through(camera), camera, pose, 0.5)
+    assert torch.equal(own.rgb, same.rgb)
+    large = camera.scaled(3.0)
+    seen = render_view(model.through(large), large, pose, 0.5).rgb
+    assert seen.shape == (72, 96, 3)
+    shrunk = seen.reshape(24, 3, 32, 3, 3).mean((1, 3))
+    assert (shrunk - own.rgb).abs().mean() < 0.2 * (own.rgb - own.rgb.mean()).abs().mean()

@@ -132,7 +132,7 @@ def events(
     opened = open_run(run, capture=capture, device=device)
     seat = _seat(opened, place, pixels.sensor)
     recorded = _recorded(opened.capture, place.view or 0) if extra.compare else None
-    edges = windows(*seat.span_us, _us(extra.frames or PIECE_MS))
+    edges = windows(*seat.span_us, _us(PIECE_MS if extra.frames is None else extra.frames))
     with _telling(console, seat.span_us) as (look, tell):
         twin = EventTwin(
             light_of(opened.model, seat, progress=look),
@@ -268,7 +268,8 @@ def _telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look,
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True) as progress:
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
         task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
 
         def look(done: int, pixels: int) -> None:

@@ -85,7 +85,9 @@ def agreement(predicted: EventStream, recorded: EventStream, edges_us: Sequence[
         recorded=len(theirs),
         count_ratio=len(mine) / len(theirs),
         pixel_correlation=float(np.corrcoef(*total)[0, 1]) if varied else math.nan,
-        count_error=float(relative_count_error(*(torch.from_numpy(part) for part in counts))),
+        count_error=float(
+            relative_count_error(*(torch.from_numpy(part).float() for part in counts))
+        ),
         sign_iou=float(same.sum() / either.sum()) if either.any() else math.nan,
         frame_psnr=_psnr(frames[0], frames[1]),
         empty_psnr=_psnr(np.zeros_like(frames[1]), frames[1]),

@@ -1,0 +1,142 @@
+"""The events command on a tiny run: what it writes, what it prints, how it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sharpfield.captures.event_cache import read_events
+from sharpfield.captures.event_layouts import open_events
+from tests.cli.test_commands import run
+
+FAST = ("--step-ms", 10, "--shortest-ms", 5)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("twin") / "tiny"
+    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
+    words = (*words, "--interval-us", 24_000, "--test-every", 4, "--threshold", 0.02)
+    assert run("simulate", "--out", out, *words) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def splats(recorded: Path) -> Path:
+    out = recorded.parent / "ev-splat"
+    words = ("--steps", 30, "--change", "gaussians.budget=300")
+    assert run("train", "ev-splat", recorded, "--out", out, *words) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def volume(recorded: Path) -> Path:
+    out = recorded.parent / "volume"
+    words = ("volume.voxels=0,4000", "volume.samples=16,0")
+    assert run("train", "nerf", recorded, "--out", out, "--steps", 4, "--change", *words) == 0
+    return out
+
+
+@pytest.mark.parametrize("kind", ["splats", "volume"])
+def test_a_stream_that_inspect_reads(
+    kind: str,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "twin.h5"
+    assert run("events", request.getfixturevalue(kind), "--out", out, *FAST) == 0
+    said = capsys.readouterr().out.replace("\n", "")
+    assert run("inspect", out, "--json") == 0
+    found = json.loads(capsys.readouterr().out)["events"]
+    assert f"{found['count']:,} events" in said and "pictures" in said
+    assert (found["width"], found["height"]) == (16, 12)
+    assert kind == "volume" or found["count"] > 100
+
+
+def test_event_frames_add_up_to_the_stream(splats: Path, tmp_path: Path) -> None:
+    out = tmp_path / "twin.h5"
+    words = ("--from", 20, "--to", 85, "--frames", 10, "--least-share", 0.3)
+    assert run("events", splats, "--out", out, *words, *FAST) == 0
+    with open_events(out) as file:
+        events = read_events(file)
+    assert events.t_us.min() >= 20_000 and events.t_us.max() < 85_000
+    counts = np.load(tmp_path / "twin-frames" / "counts.npy")
+    assert counts.shape == (7, 12, 16, 2)
+    for number, part in enumerate(counts):
+        window = events.window(20_000 + 10_000 * number, 30_000 + 10_000 * number)
+        for sign in (0, 1):
+            chosen = window.p == 2 * sign - 1
+            told = np.zeros((12, 16), int)
+            np.add.at(told, (window.y[chosen], window.x[chosen]), 1)
+            np.testing.assert_array_equal(part[..., sign], told)
+    assert len(list((tmp_path / "twin-frames").glob("*.png"))) == 7
+
+
+def test_the_same_command_gives_the_same_events(splats: Path, tmp_path: Path) -> None:
+    words = ("--sensor", "gen4-hd", "--threshold", 0.05, "--to", 60, *FAST)
+    outs = [tmp_path / f"{name}.csv" for name in "abc"]
+    for out, seed in zip(outs, (1, 1, 2), strict=True):
+        assert run("events", splats, "--out", out, "--seed", seed, *words) == 0
+    a, b, c = (out.read_text() for out in outs)
+    assert a == b != c and a.startswith("t_us,x,y,p\n")
+
+
+def test_a_path_of_its_own_and_other_pixels(
+    recorded: Path, splats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Along the capture's own path, given as a file, the camera sees what it saw."""
+    path = ("--trajectory", recorded / "trajectory.npz")
+    assert run("events", splats, "--out", tmp_path / "given.csv", *path, *FAST) == 0
+    assert run("events", splats, "--out", tmp_path / "own.csv", *FAST) == 0
+    rows = [len((tmp_path / f"{name}.csv").read_text().split()) for name in ("given", "own")]
+    assert rows[0] == pytest.approx(rows[1], rel=0.02) and rows[1] > 100
+    words = (*path, "--size", "40x24", "--to", 30, *FAST)
+    assert run("events", splats, "--out", tmp_path / "large.npz", *words) == 0
+    with np.load(tmp_path / "large.npz") as large:
+        assert (large["width"], large["height"]) == (40, 24)
+        assert large["x"].max() > 16 and large["y"].max() > 12
+
+
+def test_comparing_says_how_the_twin_agrees(
+    splats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "twin.h5"
+    assert run("events", splats, "--out", out, "--compare", "--frames", 20, *FAST) == 0
+    assert "sign_iou" in capsys.readouterr().out
+    found = json.loads((tmp_path / "twin-compare.json").read_text())
+    assert min(found["recorded"], found["predicted"]) > 100 and 0 < found["timed_share"] <= 1
+    assert found["count_ratio"] == found["predicted"] / found["recorded"]
+    assert (tmp_path / "twin-compare.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--out", "x.raw"), "unknown format of events"),
+        (("--out", "x.h5", "--sensor", "eye"), "unknown sensor"),
+        (("--out", "x.h5", "--view", 3), "no such view"),
+        (("--out", "x.h5", "--from", 50, "--to", 20), "the window of time is empty"),
+        (("--out", "x.h5", "--trajectory", "gone.txt"), "trajectory file not found"),
+        (("--out", "x.h5", "--view", 0, "--trajectory", "p.txt"), "not both"),
+        (("--out", "x.h5", "--size", "sensor"), "no size of its own"),
+        (("--out", "x.h5", "--size", "16x12", "--compare"), "at its own size"),
+        (("--out", "x.h5", "--threshold", -1), "thresholds must be positive"),
+        (("--out", "x.h5", "--step-ms", 0), "steps of time"),
+        (("--out", "x.h5", "--frames", 0), "windows must have a length"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    splats: Path,
+    words: tuple[object, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("events", splats, *words) == 2
+    said = capsys.readouterr().err
+    assert message in said and "Traceback" not in said
+    assert not list(tmp_path.iterdir())
