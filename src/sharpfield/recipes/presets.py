@@ -151,7 +151,7 @@ def refine(recipe: Splat) -> Splat:
     looks = recipe.looks
     if looks.sharp > 0:
         # Sharp pictures are made with the thresholds that are believed, and would confirm them.
-        looks = replace(looks, early=0.3, sharp=0.01, windows=0.01)
+        looks = replace(looks, early=0.3, sharp=0.01, windows=0.01, longest_us=200_000)
     return replace(recipe, looks=looks, unknowns=unknowns)
 
 

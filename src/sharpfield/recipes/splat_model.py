@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -23,7 +22,7 @@ from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group, exponential
+from sharpfield.core.schedule import Group
 from sharpfield.core.views import Views
 from sharpfield.formation.mix import mix
 from sharpfield.formation.tone import tone_of
@@ -34,16 +33,14 @@ from sharpfield.recipes.splat_start import starting_gaussians
 from sharpfield.recipes.unknowns import (
     UnknownOptions,
     Unknowns,
+    falling,
     pose_groups,
     with_learned_poses,
     with_learned_shake,
 )
+from sharpfield.recipes.window_terms import changes, count_error, threshold_error
 
 Terms = dict[str, Tensor]
-
-
-BLOCK = 8
-"""Pixels to each side of the blocks over which thresholds are learned."""
 
 
 @runtime_checkable
@@ -146,7 +143,13 @@ class SplatModel(nn.Module):
             stored = self.tone.encode(self._exposed(light.rgb, sharp[..., 0]))
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(events, EventPairs):
-            terms["events"] = self.options.windows * self._event_error(light, events)
+            unknowns = self.unknowns
+            change = changes(light, events, unknowns.response)
+            terms["events"] = self.options.windows * count_error(
+                change, events, unknowns.thresholds
+            )
+            if unknowns.learns_thresholds:
+                terms["thresholds"] = threshold_error(change, events, unknowns.thresholds)
         if (prior := self.unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms
@@ -156,35 +159,6 @@ class SplatModel(nn.Module):
             return light
         gain = self.unknowns.log_gain[seen.frame[:, 0, 0]].exp()
         return light * gain[:, None, None, None, None]
-
-    def _event_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
-        """Of all windows of one look after the other."""
-        return torch.stack(
-            [self._look_error(light[i], events[i]) for i in range(len(events))]
-        ).mean()
-
-    def _look_error(self, light: Radiance, events: EventPairs) -> Float[Tensor, ""]:
-        """Squared error of the number of events, beyond what their rounding allows.
-
-        In units of events, as their number is what was measured and what is rounded. Learned
-        thresholds have an error of their own, see `_coarse`.
-        """
-        first, pairs = events[0].reshape(-1), events.reshape(-1)
-        colours = events.shape[-1]  # 1, or 3 behind a colour filter
-        rgb = light.rgb.flatten(0, 1).repeat_interleave(colours, 0)  # [h w c, k, rgb]
-        log = self.unknowns.response(rgb, first)[..., 0]
-        change = (log[:, 1:] - log[:, :-1]).T.reshape(-1)
-        both = self.unknowns.thresholds(pairs)
-        negative, positive = (threshold.detach() for threshold in both)
-        threshold = torch.where(change > 0, positive, negative)
-        off = (change - pairs.measured(negative, positive)).abs() / threshold
-        slack = 0.0 if pairs.slack is None else pairs.slack
-        error = torch.relu(off - slack).square().mean()
-        if self.unknowns.learns_thresholds:
-            exact = torch.zeros_like(change) if pairs.slack is None else pairs.slack
-            residual = (change.detach() - pairs.measured(*both)) * (exact == 0)
-            error = error + _coarse(residual.reshape(events.shape)).square().mean()
-        return error
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
@@ -216,12 +190,11 @@ class SplatModel(nn.Module):
 
     def groups(self) -> list[Group]:
         """Gaussians, unknowns and poses."""
-        rate, steps = self.recipe.unknowns.poses_rate, max(self.recipe.steps, 1)
-        falling = exponential(rate, rate / 10, until=steps)
+        steps = max(self.recipe.steps, 1)
         return [
             *self.scene.groups(),
-            *self.unknowns.groups(),
-            *pose_groups(self.capture, falling),
+            *self.unknowns.groups(steps),
+            *pose_groups(self.capture, falling(self.recipe.unknowns.poses_rate, steps)),
         ]
 
 
@@ -235,15 +208,6 @@ class OtherLens:
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
         return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
-
-
-def _coarse(image: Float[Tensor, "q h w c"]) -> Float[Tensor, "q c y x"]:
-    """Means over blocks of pixels.
-
-    What thresholds are learned from: coarse structure is held by the frames, so that its contrast
-    is right, while fine structure is told by events alone, and would agree with any threshold.
-    """
-    return nn.functional.avg_pool2d(image.movedim(-1, 1), BLOCK, ceil_mode=True)
 
 
 def _motion_unknown(capture: Capture) -> bool:

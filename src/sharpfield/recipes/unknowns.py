@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.exposure import Exposure
-from sharpfield.core.schedule import Group, Schedule, constant
+from sharpfield.core.schedule import Group, Schedule, exponential
 from sharpfield.core.seed import generator
 from sharpfield.formation.response import FixedResponse, LogResidual, Response
 from sharpfield.formation.sharp_instants import Belief
@@ -130,13 +130,13 @@ class Unknowns(nn.Module):
             terms.append(self.log_gain.mean().square() * GAIN_PRIOR)
         return torch.stack(terms).sum() if terms else None
 
-    def groups(self) -> list[Group]:
-        """Parameters with their rates."""
+    def groups(self, steps: int) -> list[Group]:
+        """Parameters with their rates, over a schedule of so many steps."""
         options = self.options
         offset = [] if self.offset_steps is None else [self.offset_steps]
         others = [p for p in self.parameters() if all(p is not one for one in offset)]
-        found = [("unknowns", others, constant(options.rate))]
-        found.append(("offset", offset, constant(options.offset_rate_us / OFFSET_UNIT_US)))
+        found = [("unknowns", others, falling(options.rate, steps))]
+        found.append(("offset", offset, falling(options.offset_rate_us / OFFSET_UNIT_US, steps)))
         return [Group(name, tuple(own), rate) for name, own, rate in found if own]
 
 
@@ -151,6 +151,11 @@ FLOOR = 1e-4
 
 GAIN_PRIOR = 1.0
 """Weight of the mean log gain, which the scene's own brightness could take up."""
+
+
+def falling(rate: float, steps: int) -> Schedule:
+    """A rate that falls to a twentieth over a schedule, so that what it moves comes to rest."""
+    return exponential(rate, rate / 20, until=steps)
 
 
 def with_learned_poses(capture: Capture, options: UnknownOptions) -> Capture:

@@ -1,0 +1,65 @@
+"""How far whole views are from the events counted between them.
+
+A *window* is the time between two instants of a look that follow each other. Errors are in units of
+events, as their number is what was measured, and what is rounded.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.measurements import EventPairs
+from sharpfield.core.radiance import Radiance
+from sharpfield.formation.response import Response
+from sharpfield.formation.threshold import Thresholds
+
+
+def changes(light: Radiance, events: EventPairs, response: Response) -> Float[Tensor, "m q h w c"]:
+    """The change of log light over each window at every pixel.
+
+    Args:
+        light: Of the views of m looks, `[m, h, w, q + 1]`.
+        events: Of their windows, `[m, q, h, w, c]`; c = 3 behind a colour filter.
+        response: Light to the log of what a pixel reports.
+    """
+    first = events[:, 0].reshape(-1)
+    rgb = light.rgb.flatten(0, 2).repeat_interleave(events.shape[-1], 0)  # [m h w c, q + 1, rgb]
+    log = response(rgb, first)[..., 0]
+    return (log[:, 1:] - log[:, :-1]).unflatten(0, events[:, 0].shape).movedim(-1, 1)
+
+
+def count_error(
+    change: Float[Tensor, "m q h w c"], events: EventPairs, thresholds: Thresholds
+) -> Float[Tensor, ""]:
+    """Mean square of the number of events that are too many or too few beyond their rounding.
+
+    Thresholds learn nothing from this: structure so fine that the frames do not show it is told by
+    events alone, and agrees with any threshold.
+    """
+    seen = events.reshape(-1)
+    negative, positive = (threshold.detach() for threshold in thresholds(seen))
+    change = change.reshape(-1)
+    threshold = torch.where(change > 0, positive, negative)
+    off = (change - seen.measured(negative, positive)).abs() / threshold
+    return torch.relu(off - (0.0 if seen.slack is None else seen.slack)).square().mean()
+
+
+def threshold_error(
+    change: Float[Tensor, "m q h w c"], events: EventPairs, thresholds: Thresholds
+) -> Float[Tensor, ""]:
+    """Mean square of the number of events from the first instant of a look to its last.
+
+    What thresholds are learned from; the scene learns nothing. The number is taken to be off and
+    the light to be right: a scene that is still a little soft changes less than the light did, and
+    were its light taken to be off, that would be read as a smaller threshold. Over a long time,
+    events that were rounded away and light that came back matter least.
+    """
+    whole = replace(
+        events[:, 0], negative=events.negative.sum(1), positive=events.positive.sum(1), slack=None
+    ).reshape(-1)
+    negative, positive = thresholds(whole)
+    total = change.detach().sum(1).reshape(-1)
+    off = (total - whole.measured(negative, positive)) / (negative * positive).sqrt()
+    return off.square().mean()
