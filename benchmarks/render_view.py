@@ -1,6 +1,7 @@
-"""Seconds to render one 300x200 view with the networks of the paper, against the plain formulation.
+"""Seconds to render one view with the networks of the paper, against the plain formulation.
 
-    python -m benchmarks.render_view [--runs 2] [--threads 2] [--capture FOLDER]
+    python -m benchmarks.render_view [--width 300] [--runs 2] [--threads 2]
+        [--capture FOLDER]
 
 The scene is untrained, so that light comes from many samples of a ray: the hard case for us, since
 we leave out the colour of samples that add next to nothing. Seconds as in `training_step`.
@@ -16,11 +17,10 @@ from benchmarks.table import Row, save, show
 from benchmarks.training_step import ATELIER, OURS, PLAIN, built, captured
 from sharpfield.rendering.view import render_view
 
-WIDTH = 300
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--width", type=int, default=300, help="of the view, in pixels")
     parser.add_argument("--runs", type=int, default=2)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--capture", type=Path, default=ATELIER)
@@ -28,7 +28,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     clock = time.process_time if options.threads == 1 else time.perf_counter
     capture = captured(options.capture)
-    camera = capture.camera.scaled(WIDTH / capture.camera.width)
+    camera = capture.camera.scaled(options.width / capture.camera.width)
     rows: list[Row] = []
     pictures = []
     for contender in (PLAIN, *OURS):

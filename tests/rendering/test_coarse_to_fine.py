@@ -122,31 +122,6 @@ def test_fine_points_go_where_the_light_is():
     assert (inside > 64).all()  # evenly spread they would be a quarter of 128
 
 
-def test_emptiness_left_out_in_evaluation_does_not_show():
-    seen, view = rays(40), renderer()
-    full = view(seen)  # with gradients nothing is left out
-    asked: list[int] = []
-    density = view.field.fine.density
-    view.field.fine.density = lambda looked, points: (
-        asked.append(len(points)) or density(looked, points)
-    )
-    with torch.no_grad():
-        found = view(seen)
-    assert sum(asked) < 0.8 * 40 * 128
-    torch.testing.assert_close(found.rgb, full.rgb, rtol=0, atol=1e-3)
-    torch.testing.assert_close(found.depth, full.depth, rtol=0, atol=1e-3)
-
-
-@torch.no_grad()
-def test_light_that_only_the_coarse_stage_stops_reaches_the_end():
-    wall = Slab(begin=-0.1, end=0.1)
-    wall.coarse.density_inside.fill_(1e6)
-    wall.fine.density_inside.fill_(0)
-    found = CoarseToFine(wall, Frustum(CAMERA), (64, 64))(rays(40))
-    torch.testing.assert_close(found.rgb, torch.tensor([0.2, 0.5, 0.8]).expand(40, 3))
-    torch.testing.assert_close(found.depth, torch.ones(40))
-
-
 @torch.no_grad()
 def test_both_stages_are_reported():
     found = renderer()(rays(5))

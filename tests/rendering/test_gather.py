@@ -151,16 +151,6 @@ def test_training_asks_for_the_colour_of_lit_points_only(monkeypatch):
     assert lit <= sum(asked) < lit + 8 < 0.9 * RAYS * SAMPLES
 
 
-def test_what_is_not_lit_is_empty():
-    made = generator(0, 0, "lit")
-    network, given = head(), work(ordered=True)
-    lit = torch.rand(RAYS, SAMPLES, generator=made) > 0.5
-    with torch.no_grad():
-        found = gather(network, dataclasses.replace(given, lit=lit), HOWS["cleared"])
-        full = gather(network, given, HOWS["cleared"])
-    assert full.weights[~lit].any() and not found.weights[~lit].any() and found.weights[lit].any()
-
-
 @pytest.mark.parametrize("seeing", [torch.no_grad, torch.enable_grad])
 def test_an_opaque_end_stops_all_light(seeing):
     with seeing():

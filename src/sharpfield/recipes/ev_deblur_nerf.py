@@ -57,8 +57,7 @@ PAPER = Paper(
         "The gamma curve is straight below 1e-5, where its slope would be infinite.",
         "Frames look from the trajectory at mid-exposure unless their own pose is more than a pixel"
         " off; the released code always takes their own.",
-        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light,"
-        " and the fine network where the coarse one saw less than that.",
+        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light.",
     ),
 )
 

@@ -34,8 +34,7 @@ PAPER = Paper(
     departures=(
         "The scene is linear light and frames are encoded by their own response; the published"
         " code works on stored values throughout.",
-        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light,"
-        " and the fine network where the coarse one saw less than that.",
+        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light.",
     ),
 )
 

@@ -7,15 +7,15 @@ sampling and compositing.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
-from torch import Generator, Tensor, nn
+from jaxtyping import Float
+from torch import Generator, Tensor
 
 from sharpfield.core.protocols import Field
 from sharpfield.core.radiance import Radiance, Samples
 from sharpfield.core.rays import Rays
 from sharpfield.geometry.space import Space
 from sharpfield.ops import stepfun
-from sharpfield.rendering.gather import UNSEEN, Compositing, Work, gather
+from sharpfield.rendering.gather import Compositing, Work, gather
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,6 @@ class CoarseToFine:
         )
         coarse = gather(self.field.coarse, work, self.how)
 
-        lit = None if torch.is_grad_enabled() else self._lit(coarse.weights)
         more = stepfun.resample_points(z, coarse.weights.detach(), self._positions(rays, generator))
         both, order = stepfun.merge(z, more)
         work = Work(
@@ -66,7 +65,6 @@ class CoarseToFine:
             rays.direction,
             order=order,
             noise=self._noise(both.shape, generator, rays),
-            lit=None if samples else lit,
         )
         fine = gather(self.field.fine, work, self.how, keep_feature=samples)
         return Radiance(
@@ -77,15 +75,6 @@ class CoarseToFine:
             coarse=Radiance(coarse.rgb, coarse.depth, coarse.opacity, rays.weight),
             samples=None if fine.feature is None else Samples(both, fine.feature, direction),
         )
-
-    def _lit(self, weights: Float[Tensor, "b s"]) -> Bool[Tensor, "b t"]:
-        """Where the fine stage looks: at all new points, and at old ones where light may be.
-
-        That is where the coarse stage, which is not sure of the place, saw some at the point or at
-        one of its neighbours; and at the last point, which may be opaque to it alone.
-        """
-        most = nn.functional.pad(weights, (1, 1)).unfold(-1, 3, 1).amax(-1)
-        return nn.functional.pad(most[:, :-1] > UNSEEN, (0, 1 + self.samples[1]), value=True)
 
     def _coarse_depths(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "b s"]:
         even = torch.linspace(self.space.near, self.space.far, self.samples[0], device=rays.device)

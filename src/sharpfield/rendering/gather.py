@@ -40,7 +40,7 @@ class Work(Struct):
     """Points along rays, and how they are to be composited."""
 
     trailing: ClassVar = {"looked": 2, "points": 2} | dict.fromkeys(
-        ("z", "noise", "order", "lit", "direction"), 1
+        ("z", "noise", "order", "direction"), 1
     )
 
     looked: Float[Tensor, "*b s f"]
@@ -55,8 +55,6 @@ class Work(Struct):
     """Points are in this order of z; None if they ascend. Only what heads return is permuted."""
     noise: Float[Tensor, "*b s"] | None = None
     """Added to raw density."""
-    lit: Bool[Tensor, "*b s"] | None = None
-    """Where there may be light; the rest is taken as empty. None: anywhere."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def gather(head: Head, work: Work, how: Compositing, *, keep_feature: bool = Fal
     pieces = [work[first : first + step] for first in range(0, max(len(work), 1), step)]
     run = _run_with_features if keep_feature else _run
     if not torch.is_grad_enabled():
-        return Found.cat([run(head, piece, how, _lit(piece), UNSEEN) for piece in pieces])
+        return Found.cat([run(head, piece, how, None, UNSEEN) for piece in pieces])
 
     def learn(looked: Tensor, piece: Work, known: Known | None) -> tuple[Tensor | None, ...]:
         found = run(head, replace(piece, looked=looked), how, known, SPECK)
@@ -125,13 +123,6 @@ def gather(head: Head, work: Work, how: Compositing, *, keep_feature: bool = Fal
             Found(*checkpoint(learn, *inputs, use_reentrant=False, preserve_rng_state=False))
         )
     return Found.cat(parts)
-
-
-def _lit(work: Work) -> Known | None:
-    """The points that may be lit; nothing is anywhere else."""
-    if work.lit is None:
-        return None
-    return Known(_marked(work.lit), torch.full_like(work.z, -torch.inf))
 
 
 @torch.no_grad()
@@ -162,8 +153,6 @@ def _run(head: Head, work: Work, how: Compositing, known: Known | None, faint: f
     if known is not None:
         raw = known.raw.flatten().index_copy(0, known.asked, raw)
     raw = raw.view(work.z.shape)
-    if work.lit is not None:
-        raw = raw.masked_fill(~work.lit, -torch.inf)
     weights = _weights(raw, work, how)
     share = _clear(_as_they_come(weights, work), faint)
     seen = (share > 0).flatten()
