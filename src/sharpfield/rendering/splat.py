@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
+from sharpfield.core.extras import need
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.views import Views
 from sharpfield.ops.rasterize import Canvas, rasterize
@@ -71,7 +72,13 @@ class Splatting:
 
         Returns:
             Radiance `[m, h, w, k]`.
+
+        Raises:
+            MissingExtra: On a graphics card, without gsplat.
         """
+        if views.device.type == "cuda":
+            # The definition would run, and need more memory than any card has.
+            need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
         m, k = views.shape
         poses = views.pose.reshape(-1, 3, 4)
         canvas = Canvas(
