@@ -111,6 +111,19 @@ def test_nothing_happens_before_a_camera_and_a_scene_that_stand_still():
     assert still.looks == 1 + 25  # steps of 4 ms, none of them halved
 
 
+def test_a_scene_that_changes_is_seen_by_a_camera_that_stands_still():
+    class Dawn(Wall):
+        def render(self, rays: Rays) -> Radiance:
+            seen = super().render(rays)
+            return replace(seen, rgb=seen.rgb * (2 * rays.time[..., None]).exp())
+
+    own = replace(sliding(), trajectory=Still(np.eye(3, 4)[None]))
+    seat = on_track(Dawn(own), own, 0)
+    events = EventTwin(light_of(Dawn(own), seat), seat.span_us, SENSOR).until(99_000)
+    assert len(events) == 30 * 7 and set(events.p) == {1}  # at 12.5, 25, ..., 87.5 ms
+    np.testing.assert_allclose(events.t_us[::30], np.arange(1, 8) * 12_500, atol=5)
+
+
 def test_going_back_darkens_what_going_forth_brightened():
     forth, back = (
         all_of(twin(sliding(x), replace(SENSOR, threshold_off=0.25))) for x in (0.5, -0.5)

@@ -46,7 +46,7 @@ class Recording:
     motion: str = "glide"
     """A camera path by name: glide, shaky."""
     sensor: str = "ideal"
-    """An event camera by name: ideal, dvs346."""
+    """An event camera by name: ideal, dvs346, gen3-vga, gen4-hd."""
     threshold: float | None = None
     """Contrast threshold of both signs, instead of the sensor's own."""
     colour: bool = False

@@ -91,7 +91,7 @@ class EventTwin:
         self._pixels = EventPixels(sensor, seed)
         self._pictures = watch(
             lambda t_us: brightness(_in_colour(draw(t_us)), sensor.bayer),
-            np.append(np.arange(start, end, pace.step_us, np.int64), end),
+            np.append(np.arange(start, end, pace.step_us, dtype=np.int64), end),
             most_change=pace.most_change * min(sensor.threshold_on, sensor.threshold_off),
             shortest_us=pace.shortest_us,
             floor=sensor.floor,
@@ -274,10 +274,11 @@ def sized(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def _renderer(model: Any, camera: Camera) -> Any:
-    if not isinstance(model, ViewRenderer) or camera == model.capture.camera:
-        return renderer_of(model)
-    if isinstance(model, ManyLenses):
-        return model.through(camera)
+    draw = renderer_of(model)
+    if not isinstance(draw, ViewRenderer) or camera == model.capture.camera:
+        return draw
+    if isinstance(draw, ManyLenses):
+        return draw.through(camera)
     raise OptionError(
         "this model draws the views of its capture's camera only",
         got=f"{camera.width}x{camera.height}",
