@@ -191,7 +191,7 @@ def draw_pairs(
         # The reference adds 1e-5 to the upper end, which keeps it from being empty.
         span = np.rint(least - 1 + uniform * (reach - least + 1e-5)).astype(np.int64) + 1
         span = np.maximum(span, 1)
-    return _pairs(table, site, first, first + span).to(device)
+    return pairs_between(table, site, first, first + span).to(device)
 
 
 def draw_chains(
@@ -214,7 +214,7 @@ def draw_chains(
     drawn = _drawn(len(table), count, seed=seed, step=step, stream="chains")
     site, first = chain_start(table.index, table.chain, drawn)
     start = (first[:, None] + np.arange(length)).ravel()
-    pairs = _pairs(table, np.repeat(site, length), start, start + 1)
+    pairs = pairs_between(table, np.repeat(site, length), start, start + 1)
     return pairs.reshape(-1, length).to(device)
 
 
@@ -236,7 +236,7 @@ def draw_silent(
     instants = np.sort(earliest + random.random((2, count)) * (latest - earliest), 0)
     start, close = table.clock.unit(np.rint(instants).astype(np.int64))
     none = np.zeros(count, np.int64)
-    return _assembled(table, site, (start, close), (none, none)).to(device)
+    return pairs_of(table, site, (start, close), (none, none)).to(device)
 
 
 def _drawn(n: int, count: int, *, seed: int, step: int, stream: str) -> Int64[np.ndarray, "b"]:
@@ -247,25 +247,26 @@ def _drawn(n: int, count: int, *, seed: int, step: int, stream: str) -> Int64[np
     return shuffled(position, n, seed=number(seed, 0, stream), epoch=epoch)
 
 
-def _pairs(
+def pairs_between(
     table: PairTable,
     site: Int64[np.ndarray, "b"],
     first: Int64[np.ndarray, "b"],
     last: Int64[np.ndarray, "b"],
 ) -> EventPairs:
-    """Pairs of the events at positions `first` and `last` of the same site."""
+    """Pairs of the events at positions `first` and `last` of the same sites."""
     t_us = table.index.t_us
     start, end = table.clock.unit(t_us[first]), table.clock.unit(t_us[last])
     # The first event is the reference; the second and those between are what happened since.
-    return _assembled(table, site, (start, end), counts(table.index, first + 1, last + 1))
+    return pairs_of(table, site, (start, end), counts(table.index, first + 1, last + 1))
 
 
-def _assembled(
+def pairs_of(
     table: PairTable,
     site: Int64[np.ndarray, "b"],
     time: tuple[np.ndarray, np.ndarray],
     darker_brighter: tuple[np.ndarray, np.ndarray],
 ) -> EventPairs:
+    """Pairs of two unit times at sites, and how many events there were of each sign."""
     darker, brighter = darker_brighter
     channel = None if table.channel is None else table.channel[site].astype(np.int64)
     return EventPairs(

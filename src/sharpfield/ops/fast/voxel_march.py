@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.fast._voxels import add, locate, look, merge, sigmoid, softplus
 from sharpfield.ops.voxel_march import THIN, march
 
 PARTS = 2
@@ -80,54 +81,8 @@ class _March(torch.autograd.Function):
         wanted = memory(gradients[0].contiguous())
         cells = tuple(memory(grid) for grid in grids)
         spread(_backward, cells, rays, ctx.met, wanted, sums)
-        spread(_merge, sums)
+        spread(merge, sums)
         return None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
-
-
-@kernel
-def _locate(grid, x, y, z, corner, weight):
-    """The cell below a point along each axis, and the share of the next one; False outside."""
-    depth, height, width = grid.shape[0], grid.shape[1], grid.shape[2]
-    if not (-1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0):
-        return False
-    px = (x + 1.0) * 0.5 * (width - 1)
-    py = (y + 1.0) * 0.5 * (height - 1)
-    pz = (z + 1.0) * 0.5 * (depth - 1)
-    corner[0] = min(int(px), width - 2)
-    corner[1] = min(int(py), height - 2)
-    corner[2] = min(int(pz), depth - 2)
-    weight[0] = np.float32(px - corner[0])
-    weight[1] = np.float32(py - corner[1])
-    weight[2] = np.float32(pz - corner[2])
-    return True
-
-
-@kernel
-def _look(grid, corner, weight, found):
-    """Add the trilinear values at a located point."""
-    a, b, c, d = found[0], found[1], found[2], found[3]
-    for k in range(2):
-        wz = weight[2] if k else np.float32(1.0) - weight[2]
-        for j in range(2):
-            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
-            for i in range(2):
-                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
-                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
-                a += w * cell[0]
-                b += w * cell[1]
-                c += w * cell[2]
-                d += w * cell[3]
-    found[0], found[1], found[2], found[3] = a, b, c, d
-
-
-@kernel
-def _softplus(raw):
-    return raw if raw > 15.0 else math.log1p(math.exp(raw))
-
-
-@kernel
-def _sigmoid(raw):
-    return 1.0 / (1.0 + math.exp(-raw))
 
 
 @kernel
@@ -139,7 +94,7 @@ def _find(grids, rays, ray, z, scratch):
     w = origin[2] + z * direction[2]
     inside = True
     for level in range(len(grids)):
-        inside = _locate(grids[level], x, y, w, corner[level], weight[level])
+        inside = locate(grids[level], x, y, w, corner[level], weight[level])
     return inside
 
 
@@ -162,16 +117,16 @@ def _walk(grids, rays, ray, opaque_end, trace, scratch):
         found[:] = 0.0
         if inside:
             for level in range(len(grids)):
-                _look(grids[level], corner[level], weight[level], found)
+                look(grids[level], corner[level], weight[level], found)
         raw = found[0] + THIN
-        alpha = 1.0 if last else 1.0 - math.exp(-_softplus(raw))
+        alpha = 1.0 if last else 1.0 - math.exp(-softplus(raw))
         row = trace[kept]
         row[0] = s
         row[1] = alpha
         row[2] = clear * alpha
-        row[3] = 0.0 if last else _sigmoid(raw)
+        row[3] = 0.0 if last else sigmoid(raw)
         if row[2] > FAINT:
-            row[4], row[5], row[6] = _sigmoid(found[1]), _sigmoid(found[2]), _sigmoid(found[3])
+            row[4], row[5], row[6] = sigmoid(found[1]), sigmoid(found[2]), sigmoid(found[3])
         else:
             row[4] = row[5] = row[6] = 0.0
         kept += 1
@@ -215,22 +170,6 @@ def _forward(worker, workers, grids, rays, mode, met, out):
 
 
 @kernel
-def _add(grid, corner, weight, a, b, c, d):
-    """Add to the eight cells around a located point."""
-    for k in range(2):
-        wz = weight[2] if k else np.float32(1.0) - weight[2]
-        for j in range(2):
-            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
-            for i in range(2):
-                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
-                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
-                cell[0] += w * a
-                cell[1] += w * b
-                cell[2] += w * c
-                cell[3] += w * d
-
-
-@kernel
 def _backward(worker, workers, grids, rays, met, wanted, sums):
     """Gradients of the grids; part after part, each into its own sum."""
     place = rays[2]
@@ -259,7 +198,7 @@ def _backward(worker, workers, grids, rays, met, wanted, sums):
                 if not _find(grids, rays, ray, z, scratch):
                     continue
                 for level in range(len(grids)):
-                    _add(
+                    add(
                         sums[level][part],
                         corner[level],
                         weight[level],
@@ -268,13 +207,3 @@ def _backward(worker, workers, grids, rays, met, wanted, sums):
                         np.float32(row[2] * g[1] * row[5] * (1.0 - row[5])),
                         np.float32(row[2] * g[2] * row[6] * (1.0 - row[6])),
                     )
-
-
-@kernel
-def _merge(worker, workers, sums):
-    """Add all parts to the first, slice by slice."""
-    for level in range(len(sums)):
-        total = sums[level]
-        for z in range(*share(worker, workers, total.shape[1])):
-            for part in range(1, PARTS):
-                total[0, z] += total[part, z]

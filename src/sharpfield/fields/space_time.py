@@ -1,0 +1,60 @@
+"""A field over space and time without networks: voxels that stand still and voxels that move.
+
+It learns in minutes on a processor. What stands still is a dense grid, as in `fields.voxel_grid`;
+what moves is the same at a number of moments, coarser. Both add up before the activations, each
+with a grid of few cells that many rays pass.
+
+Source: direct voxel grids, DVGO (CVPR 2022), with time as a fourth axis.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+COARSER = 4
+"""Each grid has so many times fewer cells along an axis than the next."""
+
+THINNEST = 4
+"""Fewest cells along an axis of space; along time there are at least 2."""
+
+
+@dataclass(frozen=True)
+class SpaceTimeSize:
+    """Numbers of cells."""
+
+    still: int = 48
+    """Of what stands still, along each axis."""
+    moving: int = 32
+    """Of what moves, along each axis of space."""
+    moments: int = 20
+    """Of what moves, along time."""
+
+
+class SpaceTimeVoxels(nn.Module):
+    """Raw density and colour in a box from -1 to 1 and a time from 0 to 1; all zero at first.
+
+    Args:
+        size: Numbers of cells of the finest grids.
+        levels: How many grids there are of each kind.
+    """
+
+    def __init__(self, size: SpaceTimeSize, levels: int = 2) -> None:
+        super().__init__()
+
+        def cells(finest: int, level: int, least: int) -> int:
+            return max(finest // COARSER**level, least)
+
+        still = [cells(size.still, level, THINNEST) for level in range(levels)]
+        self.still = nn.ParameterList([torch.zeros(n, n, n, 4) for n in still])
+        moving = [
+            (cells(size.moments, level, 2), cells(size.moving, level, THINNEST))
+            for level in range(levels)
+        ]
+        self.moving = nn.ParameterList([torch.zeros(t, n, n, n, 4) for t, n in moving])
+        self.behind = nn.Parameter(torch.zeros(3))
+
+    def background(self) -> Float[Tensor, "3"]:
+        """Light from behind the box, 0...1: the same from everywhere and at all times."""
+        return torch.sigmoid(self.behind)

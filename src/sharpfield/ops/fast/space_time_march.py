@@ -1,0 +1,244 @@
+# pyright: basic
+"""Marching through still and moving voxels on the CPU; see `fast.voxel_march` for the plan."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sharpfield.ops.fast._kernel import kernel, memory, share, spread
+from sharpfield.ops.fast._voxels import add, locate, look, sigmoid, softplus
+from sharpfield.ops.fast.voxel_march import COLUMNS, DARK, FAINT, PARTS
+from sharpfield.ops.space_time_march import march_through_time
+from sharpfield.ops.voxel_march import THIN
+
+
+@march_through_time.accelerate("cpu", needs="numba")
+def _(
+    origin: Float[Tensor, "b 3"],
+    direction: Float[Tensor, "b 3"],
+    time: Float[Tensor, "b"],
+    place: Float[Tensor, "b s"],
+    still: Sequence[Float[Tensor, "_ _ _ 4"]],
+    moving: Sequence[Float[Tensor, "_ _ _ _ 4"]],
+) -> Float[Tensor, "b 5"]:
+    rays = (origin, direction, time, place)
+    grids = (*still, *moving)
+    if any(x.requires_grad for x in rays) or any(grid.dtype != torch.float32 for grid in grids):
+        return march_through_time.reference(*rays, still, moving)
+    given = [x.contiguous() for x in rays]
+    return _March.apply(*given, len(still), *[grid.contiguous() for grid in grids])
+
+
+class _March(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        origin: Tensor,
+        direction: Tensor,
+        time: Tensor,
+        place: Tensor,
+        still: int,
+        *grids: Tensor,
+    ) -> Tensor:
+        ctx.save_for_backward(origin, direction, time, place, *grids)
+        ctx.still = still
+        out = torch.empty(len(origin), 5)
+        rays = tuple(memory(x) for x in (origin, direction, time, place))
+        learning = any(ctx.needs_input_grad)
+        traces = len(origin) if learning else torch.get_num_threads()
+        trace = np.empty((traces, place.shape[1], COLUMNS), np.float32)
+        kept = np.empty(len(origin), np.int64)
+        spread(_forward, _field(grids, still), rays, learning, (trace, kept), memory(out))
+        ctx.met = (trace, kept) if learning else None
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        origin, direction, time, place, *grids = ctx.saved_tensors
+        rays = tuple(memory(x) for x in (origin, direction, time, place))
+        sums = [np.zeros((PARTS, *grid.shape), np.float32) for grid in grids]
+        parts = tuple(
+            (tuple(s[k] for s in sums[: ctx.still]), tuple(s[k] for s in sums[ctx.still :]))
+            for k in range(PARTS)
+        )
+        wanted = memory(gradients[0].contiguous())
+        spread(_backward, _field(grids, ctx.still), rays, ctx.met, wanted, parts)
+        for total in sums:
+            spread(_merge, total.reshape(PARTS, -1))
+        return None, None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
+
+
+def _field(grids: Sequence[Tensor], still: int) -> tuple[Any, ...]:
+    """Still and moving grids as kernels see them."""
+    views = [memory(grid) for grid in grids]
+    return tuple(views[:still]), tuple(views[still:])
+
+
+@kernel
+def _moment(grid, time):
+    """The moment before a time, and the share of the next one."""
+    at = (min(max(time, -1.0), 1.0) + 1.0) * 0.5 * (len(grid) - 1)
+    first = min(int(at), len(grid) - 2)
+    return first, np.float32(at - first)
+
+
+@kernel
+def _look_between(grid, first, later, corner, weight, found):
+    """Add the values at a located point between two moments."""
+    a, b, c, d = found[0], found[1], found[2], found[3]
+    for t in range(2):
+        wt = later if t else np.float32(1.0) - later
+        for k in range(2):
+            wz = wt * (weight[2] if k else np.float32(1.0) - weight[2])
+            for j in range(2):
+                wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
+                for i in range(2):
+                    w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                    cell = grid[first + t, corner[2] + k, corner[1] + j, corner[0] + i]
+                    a += w * cell[0]
+                    b += w * cell[1]
+                    c += w * cell[2]
+                    d += w * cell[3]
+    found[0], found[1], found[2], found[3] = a, b, c, d
+
+
+@kernel
+def _look_everywhere(field, x, y, z, time, scratch):
+    """What all grids together hold at a point and a time; False outside."""
+    found, corner, weight = scratch
+    still, moving = field
+    found[:] = 0.0
+    if not (-1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0):
+        return False
+    for level in range(len(still)):
+        locate(still[level], x, y, z, corner, weight)
+        look(still[level], corner, weight, found)
+    for level in range(len(moving)):
+        first, later = _moment(moving[level], time)
+        locate(moving[level][0], x, y, z, corner, weight)
+        _look_between(moving[level], first, later, corner, weight, found)
+    return True
+
+
+@kernel
+def _add_everywhere(field, x, y, z, time, scratch, slope, own):
+    """Add the gradient of what all grids hold at a point inside to that of their cells."""
+    _, corner, weight = scratch
+    still, moving = field
+    a, b, c, d = slope
+    for level in range(len(still)):
+        locate(still[level], x, y, z, corner, weight)
+        add(own[0][level], corner, weight, a, b, c, d)
+    for level in range(len(moving)):
+        first, later = _moment(moving[level], time)
+        locate(moving[level][0], x, y, z, corner, weight)
+        now = np.float32(1.0) - later
+        add(own[1][level][first], corner, weight, now * a, now * b, now * c, now * d)
+        add(own[1][level][first + 1], corner, weight, later * a, later * b, later * c, later * d)
+
+
+@kernel
+def _point(rays, ray, z):
+    origin, direction = rays[0], rays[1]
+    return (
+        origin[ray, 0] + z * direction[ray, 0],
+        origin[ray, 1] + z * direction[ray, 1],
+        origin[ray, 2] + z * direction[ray, 2],
+    )
+
+
+@kernel
+def _walk(field, rays, ray, trace, scratch):
+    """Fill the trace of one ray; returns how many samples it has. Columns: `voxel_march._walk`."""
+    time, place = rays[2], rays[3]
+    found = scratch[0]
+    clear, kept = 1.0, 0
+    for s in range(place.shape[1]):
+        x, y, z = _point(rays, ray, place[ray, s])
+        if not _look_everywhere(field, x, y, z, time[ray], scratch):
+            if kept:
+                break  # the box has no dents
+            continue
+        raw = found[0] + THIN
+        alpha = 1.0 - math.exp(-softplus(raw))
+        row = trace[kept]
+        row[0], row[1], row[2], row[3] = s, alpha, clear * alpha, sigmoid(raw)
+        if row[2] > FAINT:
+            row[4], row[5], row[6] = sigmoid(found[1]), sigmoid(found[2]), sigmoid(found[3])
+        else:
+            row[4] = row[5] = row[6] = 0.0
+        kept += 1
+        clear *= 1.0 - alpha
+        if clear < DARK:
+            break
+    return kept
+
+
+@kernel
+def _scratch():
+    """Room for what was found at a point, and for the point located in a grid."""
+    return np.empty(4, np.float32), np.empty(3, np.int64), np.empty(3, np.float32)
+
+
+@kernel
+def _forward(worker, workers, field, rays, learning, met, out):
+    """Colour, depth and opacity of a share of the rays, and the samples that they met."""
+    place = rays[3]
+    traces, counts = met
+    scratch = _scratch()
+    for ray in range(*share(worker, workers, len(out))):
+        trace = traces[ray if learning else worker]
+        kept = _walk(field, rays, ray, trace, scratch)
+        counts[ray] = kept
+        red = green = blue = depth = opacity = 0.0
+        for k in range(kept):
+            w = trace[k, 2]
+            red += w * trace[k, 4]
+            green += w * trace[k, 5]
+            blue += w * trace[k, 6]
+            depth += w * place[ray, int(trace[k, 0])]
+            opacity += w
+        out[ray, 0], out[ray, 1], out[ray, 2] = red, green, blue
+        out[ray, 3], out[ray, 4] = depth, opacity
+
+
+@kernel
+def _backward(worker, workers, field, rays, met, wanted, parts):
+    """Gradients of the grids; part after part, each into its own sum."""
+    time, place = rays[2], rays[3]
+    traces, counts = met
+    scratch = _scratch()
+    for part in range(worker, len(parts), workers):
+        for ray in range(*share(part, len(parts), len(wanted))):
+            g = wanted[ray]
+            behind = 0.0  # sum over later samples of weight times what it adds to the loss
+            for k in range(counts[ray] - 1, -1, -1):
+                row = traces[ray, k]
+                z = place[ray, int(row[0])]
+                value = g[0] * row[4] + g[1] * row[5] + g[2] * row[6] + g[3] * z + g[4]
+                front = row[2] / row[1] if row[1] > 0.0 else 0.0
+                slope = (
+                    np.float32(row[3] * (front * (1.0 - row[1]) * value - behind)),
+                    np.float32(row[2] * g[0] * row[4] * (1.0 - row[4])),
+                    np.float32(row[2] * g[1] * row[5] * (1.0 - row[5])),
+                    np.float32(row[2] * g[2] * row[6] * (1.0 - row[6])),
+                )
+                behind += row[2] * value
+                x, y, w = _point(rays, ray, z)
+                _add_everywhere(field, x, y, w, time[ray], scratch, slope, parts[part])
+
+
+@kernel
+def _merge(worker, workers, sums):
+    """Add all parts to the first."""
+    first, last = share(worker, workers, sums.shape[1])
+    for part in range(1, len(sums)):
+        for i in range(first, last):
+            sums[0, i] += sums[part, i]

@@ -1,0 +1,72 @@
+"""A moving scene of the recipes without networks: a capture around its middle, a field, a renderer.
+
+Its terms ask for what events leave open: what moves is smooth, in space and in time.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, Schedule
+from sharpfield.core.seed import generator
+from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
+from sharpfield.geometry.centred import centred
+from sharpfield.rendering.march_through_time import ThroughBox
+
+
+@dataclass(frozen=True)
+class MovingOptions:
+    """The field, and how rays sample it."""
+
+    size: SpaceTimeSize = field(default_factory=SpaceTimeSize)
+    steps: int = 48
+    """Of a ray from side to side of the box."""
+    smooth: float = 1e-3
+    """Weight of the total variation in space of what moves."""
+    steady: float = 1e-3
+    """Weight of its change from moment to moment."""
+
+
+class MovingScene(nn.Module):
+    """A sharp moving scene and the capture it explains, in a box around what the cameras look at.
+
+    Args:
+        options: Sizes and sampling.
+        capture: As read.
+        seed: Of the run.
+    """
+
+    def __init__(self, options: MovingOptions, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.options, self.seed = options, seed
+        self.capture, self.change = centred(capture)
+        self.path = self.capture.trajectory
+        self.field = SpaceTimeVoxels(options.size)
+        self.view = ThroughBox(self.field, step=2 / options.steps)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.field.behind.device
+
+    def sharp(self, rays: Rays, step: int, stream: str) -> Radiance:
+        """Light along rays while training: jittered by seed, step and stream."""
+        return self.view(rays, generator(self.seed, step, stream, self.device))
+
+    def roughness(self, step: int) -> Tensor:
+        """How rough what moves is in space, and how much it changes, at one random moment."""
+        grid = self.field.moving[0]
+        random = generator(self.seed, step, "moment")
+        moment = int(torch.randint(len(grid) - 1, (), generator=random))
+        part = grid[moment : moment + 2]
+        across = [part.diff(dim=axis).square().mean() for axis in (1, 2, 3)]
+        changes = part.diff(dim=0).square().mean()
+        return self.options.smooth * torch.stack(across).sum() + self.options.steady * changes
+
+    def groups(self, rate: Schedule) -> list[Group]:
+        """Voxels and background."""
+        return [Group("voxels", tuple(self.field.parameters()), rate)]
