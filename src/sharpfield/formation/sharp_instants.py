@@ -16,8 +16,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.formation.edi import FLOOR
 from sharpfield.formation.event_counts import counts_between
 from sharpfield.formation.event_motion import EventMotion
+from sharpfield.formation.ramps import ramp_at, ramped_log_mean
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
+from sharpfield.ops.event_index import EventIndex
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,14 @@ class SharpInstants:
     Args:
         capture: With frames and events.
         motion: Of its events.
+        index: Of its events, where they name the pixels of a mono sensor; light then moves between
+            events in ramps, otherwise in steps.
     """
 
-    def __init__(self, capture: Capture, motion: EventMotion) -> None:
+    def __init__(
+        self, capture: Capture, motion: EventMotion, index: EventIndex | None = None
+    ) -> None:
+        self.index, self.size = index, capture.camera.size
         self.frames, self.motion = capture.needed_frames, motion
         self.tone = tone_of(self.frames.encoding)
         exposure, train = self.frames.exposure, capture.split.train
@@ -78,6 +85,10 @@ class SharpInstants:
         opens = int(self.frames.exposure.open_us[frame])
         first, last = min(opens, time_us) + belief.late_us, max(opens, time_us) + belief.late_us
         negative, positive = counts_between(self.motion, first, last)
+        if self.index is not None:
+            begin, end = (ramp_at(self.index, t, self.size) for t in (first, last))
+            negative = negative + (end - begin)[..., :1]
+            positive = positive + (end - begin)[..., 1:]
         change = negative * belief.negative + positive * belief.positive
         stored = torch.as_tensor(self.frames.images[frame].astype(np.float32)) / self.frames.white
         blurred = self.tone.decode(stored).clamp_min(FLOOR).log()
@@ -88,10 +99,12 @@ class SharpInstants:
         if (frame, belief) not in self._log_means:
             for known in [key for key in self._log_means if key[0] == frame]:
                 del self._log_means[known]
-            window = tuple(t + belief.late_us for t in self.frames.exposure.window(frame))
-            thresholds = FixedThresholds(belief.negative, belief.positive)
-            path = self.motion.path(
-                (window[0], window[1]), np.array(window[:1], np.int64), thresholds
-            )
-            self._log_means[frame, belief] = path.log_mean.half()
+            opens, closes = (t + belief.late_us for t in self.frames.exposure.window(frame))
+            if self.index is not None:
+                thresholds = belief.negative, belief.positive
+                mean = ramped_log_mean(self.index, (opens, closes), thresholds, self.size)
+            else:
+                fixed = FixedThresholds(belief.negative, belief.positive)
+                mean = self.motion.path((opens, closes), np.array([opens]), fixed).log_mean
+            self._log_means[frame, belief] = mean.half()
         return self._log_means[frame, belief].float()

@@ -100,7 +100,7 @@ class Looks:
             self.index = None if events.rectified else event_index(events)
         known = capture.notes.get("motion") != "unknown"
         if self.motion is not None and frames is not None and options.sharp > 0 and known:
-            self.sharp = SharpInstants(capture, self.motion)
+            self.sharp = SharpInstants(capture, self.motion, self.index)
 
     def instant(self, step: int, belief: Belief) -> Batch:
         """A single view of a sharp picture, anywhere between the first and the last exposure."""
