@@ -95,7 +95,13 @@ def main() -> None:
         if contender.name in asked.only:
             rows.append(_compete(contender, folders, out, asked))
             facts = {"capture": capture.name, "minutes": asked.minutes, "seed": asked.seed}
-            print(save(f"recipes_{capture.name}", rows, {k: str(v) for k, v in facts.items()}))
+            print(
+                save(
+                    f"recipes_{capture.name}_{asked.minutes:g}min",
+                    rows,
+                    {k: str(v) for k, v in facts.items()},
+                )
+            )
     show(rows)
 
 

@@ -149,7 +149,8 @@ class SplatModel(nn.Module):
                 change, events, unknowns.thresholds
             )
             if unknowns.learns_thresholds:
-                terms["thresholds"] = threshold_error(change, events, unknowns.thresholds)
+                off = threshold_error(change, events, unknowns.thresholds)
+                terms["thresholds"] = self.options.windows * off
         if (prior := self.unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms
