@@ -30,7 +30,7 @@ def ramp_at(index: EventIndex, time_us: int, size: tuple[int, int]) -> Float[Ten
     """
     parts = np.zeros((index.sites, 2), np.float32)
     _ramps(index.offset, index.t_us, index.p, time_us, parts)
-    return torch.from_numpy(parts.reshape(size[1], size[0], 2))
+    return torch.as_tensor(parts.reshape(size[1], size[0], 2))
 
 
 def ramped_log_mean(
@@ -50,7 +50,7 @@ def ramped_log_mean(
     mean = np.zeros(index.sites)
     if window_us[1] > window_us[0]:
         _log_means(index.offset, index.t_us, index.p, window_us, thresholds, mean)
-    return torch.from_numpy(mean.astype(np.float32).reshape(size[1], size[0], 1))
+    return torch.as_tensor(mean.reshape(size[1], size[0], 1), dtype=torch.float32)
 
 
 @njit(cache=True, nogil=True)
