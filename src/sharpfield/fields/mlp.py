@@ -20,6 +20,7 @@ class MLPHead(nn.Module):
         generator: Where the first parameters come from.
         position: Octaves of the position's encoding.
         direction: Octaves of the direction's encoding.
+        colours: 3, or 1 for grey.
     """
 
     def __init__(
@@ -30,6 +31,7 @@ class MLPHead(nn.Module):
         depth: int = 8,
         position: int = 10,
         direction: int = 4,
+        colours: int = 3,
     ) -> None:
         super().__init__()
         self.position, self.direction = position, direction
@@ -40,7 +42,7 @@ class MLPHead(nn.Module):
         self.first = SplitLinear(
             width, frequencies_width(3, direction), width // 2, generator=generator
         )
-        self.last = linear(width // 2, 3, generator=generator)
+        self.last = linear(width // 2, colours, generator=generator)
 
     def density(
         self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
@@ -55,7 +57,7 @@ class MLPHead(nn.Module):
 
     def colour(
         self, feature: Float[Tensor, "*b s h"], direction: Float[Tensor, "*b 3"]
-    ) -> Float[Tensor, "*b s 3"]:
+    ) -> Float[Tensor, "*b s c"]:
         """Linear colour, 0...1."""
         ray = frequencies(direction, self.direction)
         seen = torch.relu(self.first(self.to_feature(feature), ray))
@@ -69,12 +71,25 @@ class MLPField(nn.Module):
         generator: Where the first parameters come from.
         width: Of the layers.
         depth: Number of layers.
+        colours: 3, or 1 for grey.
+        networks: 2, or 1 that is both coarse and fine.
     """
 
-    def __init__(self, *, generator: torch.Generator, width: int = 256, depth: int = 8) -> None:
+    def __init__(
+        self,
+        *,
+        generator: torch.Generator,
+        width: int = 256,
+        depth: int = 8,
+        colours: int = 3,
+        networks: int = 2,
+    ) -> None:
         super().__init__()
-        self.coarse = MLPHead(generator=generator, width=width, depth=depth)
-        self.fine = MLPHead(generator=generator, width=width, depth=depth)
+        heads = [
+            MLPHead(generator=generator, width=width, depth=depth, colours=colours)
+            for _ in range(networks)
+        ]
+        self.coarse, self.fine = heads[0], heads[-1]
 
     def look(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]

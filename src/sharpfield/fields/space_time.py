@@ -10,7 +10,7 @@ Source: direct voxel grids, DVGO (CVPR 2022), with time as a fourth axis.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 COARSER = 4
@@ -38,9 +38,11 @@ class SpaceTimeVoxels(nn.Module):
     Args:
         size: Numbers of cells of the finest grids.
         levels: How many grids there are of each kind.
+        clear: First raw density of the finest grid that stands still; below zero, the scene starts
+            nearly empty.
     """
 
-    def __init__(self, size: SpaceTimeSize, levels: int = 2) -> None:
+    def __init__(self, size: SpaceTimeSize, levels: int = 2, clear: float = 0.0) -> None:
         super().__init__()
 
         def cells(finest: int, level: int, least: int) -> int:
@@ -53,7 +55,17 @@ class SpaceTimeVoxels(nn.Module):
             for level in range(levels)
         ]
         self.moving = nn.ParameterList([torch.zeros(t, n, n, n, 4) for t, n in moving])
+        with torch.no_grad():
+            self.still[0][..., 0] = clear
         self.behind = nn.Parameter(torch.zeros(3))
+
+    def freeze(self, level: int, where: Bool[Tensor, "d h w"]) -> None:
+        """Keep moving voxels of a level at zero, where asked: only what stands still is there."""
+        kept = (~where)[None, ..., None].float()
+        self.register_buffer(f"free_{level}", kept, persistent=False)
+        self.moving[level].register_hook(
+            lambda gradient: gradient * self.get_buffer(f"free_{level}")
+        )
 
     def background(self) -> Float[Tensor, "3"]:
         """Light from behind the box, 0...1: the same from everywhere and at all times."""

@@ -8,12 +8,16 @@ from typing import Any
 
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
+from sharpfield.recipes.evdnerf import EvDNeRF
+from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, Splat
 
 RECIPES: dict[str, Any] = {
     "nerf": NeRF,
     "ev-deblur-nerf": EvDeblurNeRF,
+    "evdnerf": EvDNeRF,
+    "evdnerf-physical": EvDNeRFPhysical,
     "splat": Splat,
     "edi-splat": EdiSplat,
     "blur-splat": BlurSplat,
@@ -44,6 +48,8 @@ def recipe_named(name: str) -> Any:
 __all__ = [
     "RECIPES",
     "BlurSplat",
+    "EvDNeRF",
+    "EvDNeRFPhysical",
     "EdiSplat",
     "EvDeblurNeRF",
     "EvSplat",

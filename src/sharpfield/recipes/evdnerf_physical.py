@@ -11,7 +11,6 @@ their counts do, up to a threshold.
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -24,7 +23,7 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.formation.events import LogContrast
-from sharpfield.formation.response import FixedResponse
+from sharpfield.formation.response import FixedResponse, luma
 from sharpfield.formation.shutter import Shutter
 from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
 from sharpfield.formation.tone import tone_of
@@ -107,13 +106,14 @@ class Model(nn.Module):
     def __init__(self, recipe: EvDNeRFPhysical, capture: Capture, seed: int) -> None:
         super().__init__()
         self.recipe, self.seed = recipe, seed
-        self.scene = MovingScene(recipe.scene, capture, seed)
+        index = event_index(capture.needed_events)
+        self.scene = MovingScene(recipe.scene, capture, seed, index)
         self.capture = self.scene.capture
         self.tone = tone_of(capture.frames.encoding if capture.frames else "linear")
-        self.table = pair_table(self.capture, event_index(capture.needed_events))
+        self.table = pair_table(self.capture, index)
         camera, path = self.capture.camera, self.capture.trajectory
-        floor = float(capture.notes.get("log_floor", recipe.windows.floor))
-        self.sensor = LogContrast(camera, path, FixedResponse(floor=floor))
+        self.floor = float(capture.notes.get("log_floor", recipe.windows.floor))
+        self.sensor = LogContrast(camera, path, FixedResponse(floor=self.floor))
         kind = LearnedThresholds if recipe.windows.learn_threshold else FixedThresholds
         self.thresholds = kind(*thresholds_of(capture, recipe.windows.threshold))
         use_frames = capture.frames is not None and recipe.pixels > 0
@@ -183,8 +183,12 @@ class Model(nn.Module):
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 
+    def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+        """As the event camera sees it."""
+        return (luma(light)[..., 0] + self.floor).log()
+
     def groups(self) -> list[Group]:
-        """Voxels, planes and thresholds."""
+        """Voxels and thresholds."""
         groups = self.scene.groups(self.rate)
         if isinstance(self.thresholds, LearnedThresholds):
             own = tuple(self.thresholds.parameters())

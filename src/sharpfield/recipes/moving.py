@@ -15,6 +15,8 @@ from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
 from sharpfield.geometry.centred import centred
+from sharpfield.ops.event_index import EventIndex
+from sharpfield.recipes.swept import swept
 from sharpfield.rendering.march_through_time import ThroughBox
 
 
@@ -25,6 +27,10 @@ class MovingOptions:
     size: SpaceTimeSize = field(default_factory=SpaceTimeSize)
     steps: int = 48
     """Of a ray from side to side of the box."""
+    clear: float = -3.0
+    """First raw density of what stands still: nearly empty, as events do not say what is there."""
+    hull: bool = True
+    """Voxels move only where every camera that stands still saw events."""
     smooth: float = 1e-3
     """Weight of the total variation in space of what moves."""
     steady: float = 1e-3
@@ -38,14 +44,20 @@ class MovingScene(nn.Module):
         options: Sizes and sampling.
         capture: As read.
         seed: Of the run.
+        index: Of the capture's events, if they may say where something moves.
     """
 
-    def __init__(self, options: MovingOptions, capture: Capture, seed: int) -> None:
+    def __init__(
+        self, options: MovingOptions, capture: Capture, seed: int, index: EventIndex | None = None
+    ) -> None:
         super().__init__()
         self.options, self.seed = options, seed
         self.capture, self.change = centred(capture)
         self.path = self.capture.trajectory
-        self.field = SpaceTimeVoxels(options.size)
+        self.field = SpaceTimeVoxels(options.size, clear=options.clear)
+        if options.hull and index is not None:
+            for level, grid in enumerate(self.field.moving):
+                self.field.freeze(level, ~swept(self.capture, index, grid.shape[1]))
         self.view = ThroughBox(self.field, step=2 / options.steps)
 
     @property

@@ -14,6 +14,7 @@ from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.event_term import EventOptions
 from sharpfield.recipes.frame_term import FrameOptions
 from sharpfield.recipes.learned_blur import KernelOptions
+from sharpfield.recipes.moving_presets import EVDNERF_SIZES, EVDNERF_VARIANTS, PHYSICAL_SIZES
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.prior import PriorOptions
 from sharpfield.recipes.splats import Splat
@@ -183,6 +184,8 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
         "cdavis_full": cdavis_full,
     },
     "nerf": {},
+    "evdnerf": EVDNERF_VARIANTS,
+    "evdnerf-physical": {},
     **dict.fromkeys(SPLATS, {"refine": refine}),
 }
 """What is modelled, by recipe."""
@@ -190,6 +193,8 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
 SIZES: Mapping[str, Mapping[str, Change]] = {
     "ev-deblur-nerf": {"draft": draft, "standard": standard, "paper": paper},
     "nerf": {"draft": nerf_draft, "standard": nerf_standard, "paper": nerf_paper},
+    "evdnerf": EVDNERF_SIZES,
+    "evdnerf-physical": PHYSICAL_SIZES,
     **dict.fromkeys(SPLATS, {"draft": splat_draft, "standard": splat_standard}),
 }
 """How much of it, by recipe."""
@@ -227,7 +232,8 @@ def prepared(recipe: str, start: Any, preset: str, *, capture: Capture, device: 
             )
     if sizes and not any(name in sizes for name in chosen):
         chosen.append("draft" if device == "cpu" else "standard")
-    if variants and not any(name in variants for name in chosen) and recipe not in SPLATS:
+    published_too = "physical" in variants
+    if published_too and not any(name in variants for name in chosen):
         coloured = capture.events is not None and capture.events.coloured
         published = "cdavis_full" if coloured else "blender_full"
         chosen.insert(0, published if "paper" in chosen else "physical")

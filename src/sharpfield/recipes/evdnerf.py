@@ -1,0 +1,227 @@
+"""EvDNeRF: a moving scene from the events of several views that stand still.
+
+A. Bhattacharya et al., *EvDNeRF: Reconstructing Event Data with Dynamic Neural Radiance Fields*,
+WACV 2024. The change of log intensity of a pixel in a window of time is fitted to the events that
+were counted in it. Windows become shorter as training goes on, and begin with the earliest.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.captures import event_index
+from sharpfield.captures.draw_binned import (
+    BinnedTable,
+    Halved,
+    binned_table,
+    draw_binned,
+    open_windows,
+)
+from sharpfield.core.capture import Capture
+from sharpfield.core.measurements import Batch, EventPairs
+from sharpfield.core.paper import Paper
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group
+from sharpfield.formation.events import LogContrast
+from sharpfield.formation.response import FixedResponse, luma
+from sharpfield.losses.windows import dead_zone_error, scaled_error
+from sharpfield.recipes.event_term import thresholds_of
+from sharpfield.recipes.frame_term import Terms
+from sharpfield.recipes.volume import stages
+from sharpfield.recipes.warped_scene import WarpedOptions, WarpedScene
+
+FLOOR = 1e-10
+"""Light added before the logarithm."""
+
+PAPER = Paper(
+    key="bhattacharya2024evdnerf",
+    title="EvDNeRF: Reconstructing Event Data with Dynamic Neural Radiance Fields",
+    bibtex="""@inproceedings{bhattacharya2024evdnerf,
+  title     = {{EvDNeRF}: Reconstructing Event Data with Dynamic Neural Radiance Fields},
+  author    = {Bhattacharya, Anish and Madaan, Ratnesh and Cladera, Fernando and
+               Vemprala, Sai and Bonatti, Rogerio and Daniilidis, Kostas and
+               Kapoor, Ashish and Kumar, Vijay and Matni, Nikolai and Gupta, Jayesh K.},
+  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
+  year      = {2024}
+}""",
+    departures=(
+        "Events are counted in whole numbers at full resolution; the released code halves its data"
+        " and rounds sums of thresholds downwards (`halved`).",
+        "Event frames without events are not drawn where an event is wanted; the released code"
+        " shifts the pairing of pixels and frames from the first of them on.",
+        "The first step of each stage has the rate of its schedule, not the full one.",
+        "One run goes through all stages and keeps the moments of Adam; the released code is"
+        " started once for each.",
+        "Samples lie between two distances along the ray; the released code takes planar depths.",
+        "Lost on purpose: image loss, distortion loss, sawtooth times and count batches, which no"
+        " published configuration switches on.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Curriculum:
+    """What is looked at when."""
+
+    windows: tuple[int, ...] = (31, 63, 127)
+    """Windows that the capture is cut into, stage by stage: varied batching."""
+    stages: tuple[int, ...] = (0, 100_000, 150_000)
+    """Steps at which they begin."""
+    crop: int = 2_000
+    """Steps in which only a box around the first events is looked at."""
+    times: int = 20_000
+    """Steps in which later and later windows are opened."""
+    warm_up: int = 1_000
+    """Steps at the beginning of each stage in which the rate grows from a tenth."""
+
+    def stage(self, step: int) -> int:
+        """Which stage a step belongs to."""
+        return sum(step >= begin for begin in self.stages) - 1
+
+    def rate(self, step: int) -> float:
+        """Factor on the learning rate."""
+        since = step - self.stages[self.stage(step)]
+        return min(0.1 + 0.9 * since / self.warm_up, 1.0)
+
+    def lasting(self, factor: float) -> "Curriculum":
+        """Stretched or shrunk."""
+
+        def stretched(number: int) -> int:
+            return max(round(number * factor), 1)
+
+        return replace(
+            self,
+            stages=(0, *(stretched(begin) for begin in self.stages[1:])),
+            crop=stretched(self.crop),
+            times=stretched(self.times),
+            warm_up=stretched(self.warm_up),
+        )
+
+
+@dataclass(frozen=True)
+class EvDNeRF:
+    """Events of several still views to a moving scene. Defaults: the paper's simulated scenes."""
+
+    paper: ClassVar[Paper] = PAPER
+
+    steps: int = 200_000
+    """Length of the schedule."""
+    rate: float = 1e-4
+    """Learning rate after each warm-up."""
+    pairs: int = 1024
+    """Pixels drawn per step, each of an event frame of its own."""
+    threshold: tuple[float, float] | None = None
+    """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
+    gamma: float = 2.2
+    """The predicted change is divided by this and the measured one by its largest value, so that
+    what is learned is log intensity with its range compressed; 0 divides both by the latter."""
+    dead_zone: bool = False
+    """Changes within a threshold beyond the measured one cost nothing (published for low-contrast
+    data); replaces `gamma`."""
+    halved: Halved = "no"
+    """Whether blocks of two by two pixels count as one."""
+    one_scale: bool = False
+    """The largest change is that of the first stage throughout; released: of each stage, so that
+    the scale of what is learned jumps."""
+    coarse_loss: bool = False
+    """With two networks, the coarse one is taught, too; released: it never is."""
+    curriculum: Curriculum = field(default_factory=Curriculum)
+    scene: WarpedOptions = field(default_factory=WarpedOptions)
+
+    def lasting(self, steps: int) -> "EvDNeRF":
+        """The same recipe with its whole schedule stretched or shrunk to `steps`."""
+        curriculum = self.curriculum.lasting(steps / self.steps)
+        return replace(self, steps=steps, curriculum=curriculum)
+
+    def build(self, capture: Capture, seed: int) -> "Model":
+        """The recipe on one capture."""
+        return Model(self, capture, seed)
+
+
+class Model(nn.Module):
+    """A moving scene and the event frames it explains; frames are not used."""
+
+    heaviest_step = 0
+
+    def __init__(self, recipe: EvDNeRF, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.recipe, self.seed = recipe, seed
+        capture.needed_events  # noqa: B018 (raises where there are none)
+        self.scene = WarpedScene(recipe.scene, capture.without(frames=True), seed)
+        self.capture = self.scene.capture
+        self.threshold = thresholds_of(capture, recipe.threshold)
+        index = event_index(self.capture.needed_events)
+        self.tables: list[BinnedTable] = [
+            binned_table(index, capture.clock, windows, capture.camera.size, halved=recipe.halved)
+            for windows in recipe.curriculum.windows
+        ]
+        path = self.capture.trajectory
+        self.sensor = LogContrast(self.capture.camera, path, FixedResponse(floor=FLOOR))
+
+    def draw(self, step: int) -> Batch:
+        """Half event pixels, half any pixels, of the open windows of this stage."""
+        curriculum, table = self.recipe.curriculum, self._table(step)
+        seen = draw_binned(
+            table,
+            self.recipe.pairs,
+            seed=self.seed,
+            step=step,
+            until=open_windows(step, table.net.shape[1], curriculum.times),
+            cropped=step < curriculum.crop,
+            device=self.scene.device,
+        )
+        return {"events": seen}
+
+    def losses(self, batch: Batch, step: int) -> Terms:
+        """Error of the change in each window."""
+        assert isinstance(seen := batch["events"], EventPairs)
+        light = self.scene.sharp(self.sensor.expose(seen), step, "events")
+        taught = stages(light) if self.recipe.coarse_loss else [light]
+        errors = [
+            self.error(self.sensor.observe(stage, seen)[:, 0], seen, step) for stage in taught
+        ]
+        return {"events": torch.stack(errors).sum()}
+
+    def error(
+        self, predicted: Float[Tensor, "b"], seen: EventPairs, step: int
+    ) -> Float[Tensor, ""]:
+        """How far changes are from what was counted."""
+        measured = seen.measured(*self.threshold)
+        if self.recipe.dead_zone:
+            return dead_zone_error(predicted, measured, sum(self.threshold) / 2)
+        most = self.most(step)
+        return scaled_error(
+            predicted, measured, scale=self.recipe.gamma or most, measured_scale=most
+        )
+
+    def most(self, step: int) -> float:
+        """Largest measured change of the stage of a step."""
+        table = self.tables[0] if self.recipe.one_scale else self._table(step)
+        return max(table.most, 1) * max(self.threshold)
+
+    def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+        """As the event camera sees it, after the last stage: what is learned is compressed."""
+        log = (luma(light)[..., 0] + FLOOR).log()
+        if self.recipe.dead_zone or not self.recipe.gamma:
+            return log
+        return log * (self.most(self.recipe.steps) / self.recipe.gamma)
+
+    def render(self, rays: Rays) -> Radiance:
+        """Light, up to a power and a factor."""
+        return self.scene.view(rays)
+
+    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """As it is: events do not tell how frames would store it."""
+        return light.clamp(0, 1)
+
+    def groups(self) -> list[Group]:
+        """All networks at one rate."""
+        recipe = self.recipe
+        return self.scene.groups(lambda step: recipe.rate * recipe.curriculum.rate(step))
+
+    def _table(self, step: int) -> BinnedTable:
+        return self.tables[self.recipe.curriculum.stage(step)]

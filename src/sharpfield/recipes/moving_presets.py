@@ -1,0 +1,55 @@
+"""Presets of the recipes for moving scenes."""
+
+from dataclasses import replace
+
+from sharpfield.fields.space_time import SpaceTimeSize
+from sharpfield.recipes.evdnerf import EvDNeRF
+from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
+
+
+def lego(recipe: EvDNeRF) -> EvDNeRF:
+    """The paper's recipe for low contrast: a dead zone, and a tenth of the rate."""
+    return replace(recipe, rate=recipe.rate / 10, dead_zone=True)
+
+
+def real(recipe: EvDNeRF) -> EvDNeRF:
+    """The paper's recipe for real data: two networks, no compression."""
+    curriculum = replace(recipe.curriculum, windows=(99,), stages=(0,), crop=5_000, times=30_000)
+    scene = replace(recipe.scene, networks=2)
+    return replace(recipe, steps=50_000, gamma=0.0, curriculum=curriculum, scene=scene)
+
+
+def evdnerf_draft(recipe: EvDNeRF) -> EvDNeRF:
+    """Smaller networks, fewer pixels, a higher rate; minutes on two processor cores."""
+    scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
+    return replace(recipe.lasting(2000), rate=10 * recipe.rate, pairs=128, scene=scene)
+
+
+def evdnerf_standard(recipe: EvDNeRF) -> EvDNeRF:
+    """Half as wide and a tenth as long; for a graphics card."""
+    scene = replace(recipe.scene, width=128, samples=(48, 64))
+    return replace(recipe.lasting(20_000), rate=5 * recipe.rate, scene=scene)
+
+
+def evdnerf_paper(recipe: EvDNeRF) -> EvDNeRF:
+    """The published networks and length."""
+    return recipe
+
+
+def physical_draft(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
+    """Minutes on two processor cores."""
+    windows = replace(recipe.windows, spans=192, counted=192)
+    return replace(recipe.lasting(4000), windows=windows)
+
+
+def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
+    """Finer in space and time; an hour on a processor."""
+    size = SpaceTimeSize(still=96, moving=56, moments=40)
+    scene = replace(recipe.scene, size=size, steps=96)
+    windows = replace(recipe.windows, spans=768, counted=768)
+    return replace(recipe.lasting(12_000), scene=scene, windows=windows)
+
+
+EVDNERF_VARIANTS = {"lego": lego, "real": real}
+EVDNERF_SIZES = {"draft": evdnerf_draft, "standard": evdnerf_standard, "paper": evdnerf_paper}
+PHYSICAL_SIZES = {"draft": physical_draft, "standard": physical_standard}
