@@ -14,7 +14,6 @@ Robust e-NeRF (ICCV 2023) for reference levels.
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Int64
 
 from sharpfield.captures.draw import Device, PairTable, pairs_between, pairs_of

@@ -26,6 +26,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
 from sharpfield.evaluation.device import device_of
+from sharpfield.evaluation.event_scores import event_scores
 from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.reference import Reference, held_out, trained_on
@@ -116,6 +117,8 @@ def evaluate(
         "train_views": _summary(learned, train_views, brightness, lpips),
         "train": _training(run),
     }
+    if (events := event_scores(model, capture)) is not None:
+        metrics["events"] = events
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
     with replacing(run / METRICS) as temporary:

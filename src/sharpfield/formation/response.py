@@ -57,7 +57,7 @@ def passed(light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b 
     return light.gather(-1, channel)
 
 
-def luma(light: Float[Tensor, "b k d"]) -> Float[Tensor, "b k 1"]:
+def luma(light: Float[Tensor, "*b d"]) -> Float[Tensor, "*b 1"]:
     """What a mono pixel sees of three colours; a single colour is returned as it is."""
     if light.shape[-1] == 1:
         return light

@@ -1,0 +1,91 @@
+"""Voxels over space and time."""
+
+import torch
+
+from sharpfield.core.rays import Rays
+from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
+from sharpfield.ops.space_time_march import march_through_time
+from sharpfield.ops.voxel_march import march
+from sharpfield.rendering.march_through_time import ThroughBox, through_box
+
+SIZE = SpaceTimeSize(still=8, moving=6, moments=5)
+
+
+def rays(count: int = 6) -> Rays:
+    made = torch.Generator().manual_seed(1)
+    origin = torch.tensor([0.0, 0.0, -3.0]) + 0.3 * torch.rand(count, 3, generator=made)
+    direction = torch.nn.functional.normalize(
+        torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(count, 3, generator=made), dim=-1
+    )
+    return Rays(origin, direction, torch.rand(count, generator=made), torch.ones(count))
+
+
+def filled(tensor: torch.Tensor) -> torch.Tensor:
+    return 3 * torch.randn(tensor.shape, generator=torch.Generator().manual_seed(len(tensor)))
+
+
+def test_moving_voxels_that_are_alike_at_all_moments_stand_still():
+    seen, grid = rays(), filled(torch.zeros(4, 5, 6, 4))
+    place = torch.linspace(1.5, 5, 12).expand(6, -1).contiguous()
+    still = march(seen.origin, seen.direction, place, [grid], opaque_end=False)
+    zeros = torch.zeros(2, 2, 2, 4)
+    always = grid.expand(3, -1, -1, -1, -1).contiguous()
+    found = march_through_time(
+        seen.origin, seen.direction, 2 * seen.time - 1, place, [zeros], [always]
+    )
+    torch.testing.assert_close(found, still, atol=1e-5, rtol=0)
+
+
+def test_at_a_moment_only_its_own_cells_count():
+    field = SpaceTimeVoxels(SIZE)
+    with torch.no_grad():
+        field.moving[0][2] = filled(field.moving[0][2])
+    view = ThroughBox(field, step=0.1)
+    empty = ThroughBox(SpaceTimeVoxels(SIZE), step=0.1)
+    for moment, changed in ((0.25, False), (0.5, True), (0.75, False), (0.6, True)):
+        at = rays().map(lambda tensor, _: tensor)
+        at = Rays(at.origin, at.direction, torch.full((6,), moment), at.weight)
+        differs = (view(at).rgb - empty(at).rgb).abs().max() > 1e-4
+        assert bool(differs) == changed, moment
+
+
+def test_rays_of_one_measurement_are_shifted_alike():
+    field = SpaceTimeVoxels(SIZE)
+    with torch.no_grad():
+        field.still[0].copy_(filled(field.still[0]))
+    both = rays().reshape(6, 1)
+    both = Rays.cat([both, both]).reshape(2, 6)
+    pairs = both.map(lambda tensor, _: tensor.transpose(0, 1))
+    light = ThroughBox(field, step=0.1)(pairs, torch.Generator().manual_seed(3)).rgb
+    assert torch.equal(light[:, 0], light[:, 1])
+    again = ThroughBox(field, step=0.1)(pairs, torch.Generator().manual_seed(4)).rgb
+    assert not torch.equal(light, again)
+
+
+def test_where_rays_enter_and_leave():
+    straight = Rays(
+        torch.tensor([[0.0, 0, -3], [0, 0, 0.5], [0, 5, -3]]),
+        torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1]]),
+        torch.zeros(3),
+        torch.ones(3),
+    )
+    enter, leave = through_box(straight)
+    torch.testing.assert_close(enter, torch.tensor([2.0, 0.0, 0.0]))
+    torch.testing.assert_close(leave, torch.tensor([4.0, 0.5, 0.0]))
+
+
+def test_frozen_cells_get_no_gradient():
+    field = SpaceTimeVoxels(SIZE)
+    where = torch.zeros(6, 6, 6, dtype=torch.bool)
+    where[:3] = True
+    field.freeze(0, where)
+    ThroughBox(field, step=0.1)(rays()).rgb.square().sum().backward()
+    gradient = field.moving[0].grad
+    assert gradient is not None
+    assert not gradient[:, :3].any() and gradient[:, 3:].any()
+
+
+def test_it_may_start_nearly_empty():
+    clear = ThroughBox(SpaceTimeVoxels(SIZE, clear=-4.0), step=0.1)(rays()).opacity.max()
+    fog = ThroughBox(SpaceTimeVoxels(SIZE), step=0.1)(rays()).opacity.max()
+    assert clear < 0.01 < 0.1 < fog
