@@ -4,6 +4,7 @@ Its terms ask for what events leave open: what moves is smooth, in space and in 
 """
 
 from dataclasses import dataclass, field
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +18,7 @@ from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
 from sharpfield.geometry.centred import centred
 from sharpfield.ops.event_index import EventIndex
 from sharpfield.recipes.swept import swept
-from sharpfield.rendering.march_through_time import ThroughBox
+from sharpfield.rendering.march_through_time import SpaceTime, ThroughBox
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class MovingScene(nn.Module):
         if options.hull and index is not None:
             for level, grid in enumerate(self.field.moving):
                 self.field.freeze(level, ~swept(self.capture, index, grid.shape[1]))
-        self.view = ThroughBox(self.field, step=2 / options.steps)
+        self.view = ThroughBox(cast(SpaceTime, self.field), step=2 / options.steps)
 
     @property
     def device(self) -> torch.device:

@@ -112,11 +112,12 @@ def joined(parts: list[Radiance]) -> Radiance:
     """Radiances `[b, 1]` side by side, `[b, k]`."""
 
     def along(seen: list[Radiance]) -> Radiance:
-        columns = {
-            name: torch.cat([getattr(one, name) for one in seen], 1)
-            for name in ("rgb", "depth", "opacity", "weight")
-        }
-        return Radiance(**columns)
+        return Radiance(
+            torch.cat([one.rgb for one in seen], 1),
+            torch.cat([one.depth for one in seen], 1),
+            torch.cat([one.opacity for one in seen], 1),
+            torch.cat([one.weight for one in seen], 1),
+        )
 
     coarse = [one.coarse for one in parts if one.coarse is not None]
     whole = along(parts)
