@@ -1,7 +1,11 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+
+from sharpfield.core import EventStream
+from tests.streams import random_events
 
 SAMPLES = Path(__file__).parents[1].parent / "shared" / "data"
 
@@ -18,3 +22,9 @@ def samples() -> Path:
     if not SAMPLES.is_dir():
         pytest.skip("no sample recordings in ../shared/data beside the checkout")
     return SAMPLES
+
+
+@pytest.fixture
+def some_events() -> Callable[..., EventStream]:
+    """Makes random streams of a tiny sensor."""
+    return random_events

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1] / "src" / "sharpfield"
 FLOORS = [
     ["core"],
-    ["geometry", "ops"],
+    ["geometry", "ops", "storage"],
     "captures recordings fields rendering formation losses metrics simulation".split(),
     ["recipes", "training", "evaluation", "preparation"],
     ["cli", "viewer"],

@@ -1,12 +1,11 @@
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from sharpfield.core import Camera, Capture, Clock, EventStream, Exposure, Frames, Split
+from sharpfield.core import Camera, Capture, Clock, Exposure, Frames, Split
 from sharpfield.geometry.trajectory import Stamped
+from tests.streams import HEIGHT, WIDTH, random_events
 
-WIDTH, HEIGHT, FRAMES = 12, 10, 9
+FRAMES = 9
 
 
 def turning(times_us: np.ndarray) -> np.ndarray:
@@ -19,23 +18,6 @@ def turning(times_us: np.ndarray) -> np.ndarray:
     ).reshape(-1, 3, 3)
     centre = np.stack([angle, 0.5 * angle**2, -angle], -1)
     return np.concatenate([rotation, centre[:, :, None]], -1)
-
-
-def random_events(count: int, *, last_us: int = 90_000, seed: int = 0) -> EventStream:
-    draw = np.random.default_rng(seed)
-    return EventStream(
-        x=draw.integers(0, WIDTH, count).astype(np.uint16),
-        y=draw.integers(0, HEIGHT, count).astype(np.uint16),
-        t_us=np.sort(draw.integers(1_000, last_us, count)),
-        p=draw.choice(np.array([-1, 1], np.int8), count),
-        width=WIDTH,
-        height=HEIGHT,
-    )
-
-
-@pytest.fixture
-def some_events() -> Callable[..., EventStream]:
-    return random_events
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import pytest
 
 from sharpfield.captures import event_cache
 from sharpfield.captures.event_cache import cache_folder, event_index, read_events
-from sharpfield.captures.event_layouts import open_events
-from sharpfield.captures.event_writer import write_events
 from sharpfield.core.errors import CaptureError
 from sharpfield.ops.event_index import build
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import write_events
 
 COLUMNS = ("x", "y", "t_us", "p")
 

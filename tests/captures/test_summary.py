@@ -5,9 +5,10 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures import summary, write, write_events, write_llff_events
+from sharpfield.captures import summary, write, write_llff_events
 from sharpfield.captures.summary import capture_summary
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage import write_events
 
 
 def write_flat(path, events, factor=1):

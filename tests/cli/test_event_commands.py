@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.event_layouts import open_events
+from sharpfield.storage.event_layouts import open_events
 from tests.cli.test_commands import run
 
 FAST = ("--step-ms", 10, "--shortest-ms", 5)

@@ -11,17 +11,12 @@ from sharpfield.captures.draw import (
     pixel_table,
 )
 from sharpfield.captures.event_cache import event_index, read_events
-from sharpfield.captures.event_file import EventFile
-from sharpfield.captures.event_layouts import open_events
-from sharpfield.captures.event_writer import EventWriter, write_events, writing_events
 from sharpfield.captures.native import write
 from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read
 from sharpfield.captures.summary import capture_summary, summary
 
 __all__ = [
     "LAYOUTS",
-    "EventFile",
-    "EventWriter",
     "Layout",
     "PairTable",
     "PixelTable",
@@ -32,13 +27,10 @@ __all__ = [
     "draw_silent",
     "event_index",
     "layout_of",
-    "open_events",
     "pair_table",
     "pixel_table",
     "read",
     "read_events",
     "summary",
     "write",
-    "write_events",
-    "writing_events",
 ]

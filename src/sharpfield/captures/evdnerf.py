@@ -20,10 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Shaped
 
-from sharpfield.captures.arrays import load_array, load_arrays
 from sharpfield.captures.binned_events import smallest_step, unbinned
-from sharpfield.captures.event_columns import coordinates, polarity, whole_us
-from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.pickled import load_pickled
 from sharpfield.captures.timed_views import (
     ONE_SECOND,
@@ -40,6 +37,9 @@ from sharpfield.core.events import EventStream, checked, merged
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import Still
+from sharpfield.storage.arrays import load_array, load_arrays
+from sharpfield.storage.event_columns import coordinates, polarity, whole_us
+from sharpfield.storage.event_layouts import THRESHOLDS
 
 TEST_EVERY = 8
 """Of the held-out frames every so many are for testing; all would take hours to render."""

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.captures.event_file import EventFile
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.ops.event_index import EventIndex, build
 from sharpfield.ops.event_index_files import file_key, index_on_disk
+from sharpfield.storage.event_file import EventFile
 
 IN_MEMORY = 50_000_000
 """Up to this many events (0.7 GB) are loaded, more are mapped."""

@@ -25,11 +25,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64, Shaped
 
-from sharpfield.captures.arrays import load_array, load_arrays
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.event_columns import whole_us
-from sharpfield.captures.event_layouts import THRESHOLDS, open_events
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import choose_images
@@ -44,6 +41,9 @@ from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry import se3
 from sharpfield.geometry.normalise import REFERENCE
 from sharpfield.geometry.trajectory import Stamped, Tracks
+from sharpfield.storage.arrays import load_array, load_arrays
+from sharpfield.storage.event_columns import whole_us
+from sharpfield.storage.event_layouts import THRESHOLDS, open_events
 
 LAYOUT = "ev-deblur-nerf"
 

@@ -3,7 +3,7 @@
 capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes: to be read
 frames/NAME.png    8 or 16 bit, grey or RGB
 truth/NAME.png     sharp images at mid-exposure, where known
-events.h5          see `captures.event_writer`
+events.h5          see `storage.event_writer`
 test_events.h5     likewise, of held-out cameras, if any
 truth/depth.npy, truth/flow.npy     of all frames, where known; see `Frames`
 trajectory.npz     see `captures.native_trajectory`
@@ -19,11 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from sharpfield.captures.arrays import load_array, load_arrays, write_arrays
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.event_layouts import open_events
-from sharpfield.captures.event_writer import write_events
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.native_frames import read_frames, write_frames
 from sharpfield.captures.native_trajectory import read_trajectory, write_trajectory
@@ -36,6 +33,9 @@ from sharpfield.core.files import replacing_folder
 from sharpfield.core.frames import Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import count_tracks
+from sharpfield.storage.arrays import load_array, load_arrays, write_arrays
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import write_events
 
 FORMAT, VERSION = "sharpfield-capture", 1
 

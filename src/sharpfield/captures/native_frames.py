@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from sharpfield.captures.arrays import load_array
 from sharpfield.captures.images import describe, read_images, write_image
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
+from sharpfield.storage.arrays import load_array
 
 FRAMES, TRUTH = "frames", "truth"
 GEOMETRY = {"depth": (), "flow": (2,)}

@@ -17,12 +17,12 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
-from sharpfield.captures.arrays import load_arrays, write_arrays
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import BSpline, Stamped, Still, Tracks
+from sharpfield.storage.arrays import load_arrays, write_arrays
 
 FILE = "trajectory.npz"
 

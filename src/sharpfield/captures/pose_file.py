@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from sharpfield.captures.arrays import load_arrays
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import check_poses
+from sharpfield.storage.arrays import load_arrays
 
 Path3 = tuple[Int64[np.ndarray, "p"], Float64[np.ndarray, "p 3 4"]]
 """Times in us, and world-from-camera poses."""

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from sharpfield.captures.arrays import load_array
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.trajectory import check_poses
+from sharpfield.storage.arrays import load_array
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from sharpfield.captures import (
     nerfstudio,
     robust_e_nerf,
 )
-from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.photos import Missing
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.storage.event_layouts import THRESHOLDS
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 
 from sharpfield.captures import llff_events
-from sharpfield.captures.event_columns import polarity
-from sharpfield.captures.event_file import CHUNK, EventFile
-from sharpfield.captures.event_layouts import open_events
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import count_tracks
+from sharpfield.storage.event_columns import polarity
+from sharpfield.storage.event_file import CHUNK, EventFile
+from sharpfield.storage.event_layouts import open_events
 
 PATH_SAMPLES = 1000
 """Instants at which the length of a trajectory is measured."""

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from sharpfield.captures.evdnerf import recognise
-from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.images import write_image
 from sharpfield.captures.transforms import OPENCV_FROM_OPENGL
@@ -28,6 +27,7 @@ from sharpfield.core.files import replacing_folder
 from sharpfield.geometry.trajectory import Still
 from sharpfield.ops.event_image import window_image
 from sharpfield.ops.event_index import build
+from sharpfield.storage.event_layouts import THRESHOLDS
 
 SECOND_NS = 1_000_000_000
 

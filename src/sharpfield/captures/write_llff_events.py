@@ -15,8 +15,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64, Shaped
 
-from sharpfield.captures.event_file import CHUNK
-from sharpfield.captures.event_layouts import THRESHOLDS
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.images import write_image
@@ -28,6 +26,8 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import Stamped, Tracks
+from sharpfield.storage.event_file import CHUNK
+from sharpfield.storage.event_layouts import THRESHOLDS
 
 STAMP_US = 5_000
 """Distance of the stamps where the trajectory is not stamped itself."""

@@ -4,14 +4,14 @@ import zipfile
 import numpy as np
 import pytest
 
-from sharpfield.captures.event_columns import (
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.storage.event_columns import (
     ZippedColumn,
     coordinates,
     known_unit,
     polarity,
     whole_us,
 )
-from sharpfield.core.errors import CaptureError, OptionError
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int64
 
-from sharpfield.captures.event_columns import Stored, coordinates, polarity, whole_us
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour, checked
+from sharpfield.storage.event_columns import Stored, coordinates, polarity, whole_us
 
 CHUNK = 2**20
 """Events looked at together; bounds the memory of whatever goes through a file."""

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.event_formats import FORMATS, exporting_events
-from sharpfield.captures.event_layouts import open_events
 from sharpfield.core.errors import OptionError
+from sharpfield.storage.event_formats import FORMATS, exporting_events
+from sharpfield.storage.event_layouts import open_events
 
 
 def read_back(path):

@@ -19,11 +19,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from sharpfield.captures.event_file import CHUNK
-from sharpfield.captures.event_layouts import compression_plugin
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
+from sharpfield.storage.event_file import CHUNK
+from sharpfield.storage.event_layouts import compression_plugin
 
 FORMAT, VERSION = "sharpfield-events", 1
 ROWS = 65_536

@@ -2,7 +2,7 @@
 
 - DSEC: HDF5 with `events/{x, y, t, p}`, times in us after `t_offset`, and `ms_to_idx`, which
   gives the first event at or after each millisecond.
-- Ours: a superset of it, written by `captures.event_writer`. Attributes give the sensor's size and
+- Ours: a superset of it, written by `storage.event_writer`. Attributes give the sensor's size and
   the unit; any tool that reads DSEC reads it.
 - Flat: HDF5 or npz with `x, y, t, p` at the root (EDS, Ev-DeblurNeRF, vid2e). It says neither
   the unit of its times nor the size of the sensor, so the caller must.
@@ -22,10 +22,10 @@ from types import ModuleType
 import h5py
 import numpy as np
 
-from sharpfield.captures.event_columns import ZippedColumn, known_unit, whole_us
-from sharpfield.captures.event_file import EventFile
 from sharpfield.core.errors import CaptureError, MissingExtra
 from sharpfield.core.events import SiteColour
+from sharpfield.storage.event_columns import ZippedColumn, known_unit, whole_us
+from sharpfield.storage.event_file import EventFile
 
 COLUMNS = ("x", "y", "t", "p")
 TRACK = "track"

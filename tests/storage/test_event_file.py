@@ -2,10 +2,10 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures import event_file
-from sharpfield.captures.event_layouts import open_events
-from sharpfield.captures.event_writer import write_events
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage import event_file
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import write_events
 
 SIZE = (12, 10)
 

@@ -1,6 +1,6 @@
 """Writing events in the format that a file's name asks for, in as many pieces as you like.
 
-    .h5     our own, see `captures.event_writer`: it says its units and its sensor
+    .h5     our own, see `storage.event_writer`: it says its units and its sensor
     .npz    arrays x, y, t (us), p (-1 or +1) at the root, and width, height
     .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
 
@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.captures.arrays import write_arrays
-from sharpfield.captures.event_writer import writing_events
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing
+from sharpfield.storage.arrays import write_arrays
+from sharpfield.storage.event_writer import writing_events
 
 Append = Callable[[EventStream], None]
 """Takes events that come after all earlier ones."""

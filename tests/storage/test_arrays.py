@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from sharpfield.captures.arrays import load_array, load_arrays, write_arrays
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.arrays import load_array, load_arrays, write_arrays
 
 
 def test_arrays_come_back_whatever_their_name(tmp_path):

@@ -1,0 +1,5 @@
+"""A camera's own files, one module per format, opened without being loaded."""
+
+from sharpfield.recordings.recording import Frame, Recording, Triggers, Trouble
+
+__all__ = ["Frame", "Recording", "Triggers", "Trouble"]
