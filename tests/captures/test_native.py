@@ -282,3 +282,18 @@ def test_events_of_another_tool_may_need_their_unit(tiny, tmp_path):
     assert '[events] unit = "ns"' in str(caught.value)
     (tmp_path / "capture.toml").write_text(text + '[events]\nunit = "ns"\n')
     assert differences(native.read(tmp_path), tiny) == []
+
+
+# Poses that nobody knows yet
+
+
+def test_a_capture_without_poses_is_read_only_by_what_needs_none(tiny, tmp_path):
+    unposed = replace(
+        tiny, trajectory=Still(np.eye(3, 4)[None]), notes={"poses": "unknown", "lux": 3.0}
+    )
+    native.write(unposed, tmp_path)
+    assert differences(native.read_unposed(tmp_path), unposed) == []
+    with pytest.raises(CaptureError, match="nobody knows yet where the camera was") as caught:
+        native.read(tmp_path)
+    assert "sharpfield poses" in str(caught.value)
+    assert str(tmp_path) in str(caught.value)

@@ -12,7 +12,7 @@ from sharpfield.captures.draw import (
 )
 from sharpfield.captures.event_cache import event_index, read_events
 from sharpfield.captures.native import write
-from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read
+from sharpfield.captures.read import LAYOUTS, Layout, layout_of, read, read_unposed
 from sharpfield.captures.summary import capture_summary, summary
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "pixel_table",
     "read",
     "read_events",
+    "read_unposed",
     "summary",
     "write",
 ]

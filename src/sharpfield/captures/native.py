@@ -10,6 +10,9 @@ trajectory.npz     see `captures.native_trajectory`
 points.npy         sparse scene points, if any
 notes.npz          notes that are arrays, if any
 cache/             derived; delete it when you like
+
+A capture that was just recorded has no poses yet. It is kept with a camera that stands still, and
+the note `poses = "unknown"` says that this is only a stand-in.
 """
 
 import dataclasses
@@ -43,6 +46,9 @@ DESCRIPTION = "capture.toml"
 EVENTS, TEST_EVENTS = "events.h5", "test_events.h5"
 POINTS = "points.npy"
 NOTES = "notes.npz"
+POSES, INTRINSICS, BOUNDS, UNKNOWN = "poses", "intrinsics", "bounds", "unknown"
+"""Notes that say of poses, focal length and depth bounds that nobody knows them yet."""
+
 NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
@@ -96,6 +102,36 @@ def write(capture: Capture, folder: Path | str) -> None:
 
 def read(folder: Path) -> Capture:
     """Read a capture.
+
+    Raises:
+        CaptureError: Something is missing or malformed, does not fit together, or nobody knows
+            the poses yet.
+    """
+    return expect_poses(read_unposed(folder), folder)
+
+
+def expect_poses(capture: Capture, where: object) -> Capture:
+    """The capture itself, once it is known that its poses are no stand-in.
+
+    Raises:
+        CaptureError: They are.
+    """
+    if capture.notes.get(POSES) == UNKNOWN:
+        raise CaptureError(
+            "nobody knows yet where the camera was",
+            where=where,
+            got=f'a note `{POSES} = "{UNKNOWN}"`',
+            do="find the poses with `sharpfield poses`, or ingest the recording with --poses FILE",
+        )
+    return capture
+
+
+def read_unposed(folder: Path) -> Capture:
+    """Read a capture, whether its poses are known or not: what comes before training needs none.
+
+    Where they are not, `notes["poses"]` is "unknown" and the trajectory is a camera that stands
+    still at the origin. Likewise `notes["intrinsics"]` is "unknown" where the focal length is only
+    a stand-in (the image's width), and `notes["bounds"]` where `near` and `far` are.
 
     Raises:
         CaptureError: Something is missing or malformed, or does not fit together.

@@ -38,7 +38,7 @@ class Layout:
 
 
 LAYOUTS: dict[str, Layout] = {
-    "native": Layout(native.recognise, native.read, "capture.toml"),
+    "native": Layout(native.recognise, native.read_unposed, "capture.toml"),
     "ev-deblur-nerf": Layout(
         llff_events.recognise,
         llff_events.read,
@@ -133,6 +133,39 @@ def read(
             are built from them, and anything else is refused.
 
     Raises:
+        CaptureError: The capture cannot be read, or nobody knows its poses yet.
+        OptionError: An option does not fit the layout.
+    """
+    capture = read_unposed(
+        folder,
+        layout=layout,
+        event_unit=event_unit,
+        missing=missing,
+        threshold=threshold,
+        trust_pickle=trust_pickle,
+    )
+    native.expect_poses(capture, folder)
+    if encoding is not None:
+        capture = replace(capture, frames=replace(capture.needed_frames, encoding=encoding))
+    if hold_out is not None:
+        capture = replace(capture, split=split_by_rule(len(capture.needed_frames), hold_out))
+    return capture
+
+
+def read_unposed(
+    folder: Path | str,
+    *,
+    layout: str | None = None,
+    event_unit: str | None = None,
+    missing: Missing | None = None,
+    threshold: float | None = None,
+    trust_pickle: bool = False,
+) -> Capture:
+    """Read a capture, whether its poses are known or not; see `native.read_unposed`.
+
+    The options are those of `read`.
+
+    Raises:
         CaptureError: The capture cannot be read.
         OptionError: An option does not fit the layout.
     """
@@ -155,10 +188,6 @@ def read(
             do=f"it belongs to {', '.join(able)}",
         )
     capture = LAYOUTS[name].read(folder, **given)
-    if encoding is not None:
-        capture = replace(capture, frames=replace(capture.needed_frames, encoding=encoding))
-    if hold_out is not None:
-        capture = replace(capture, split=split_by_rule(len(capture.needed_frames), hold_out))
     if threshold is not None:
         known = dict.fromkeys(THRESHOLDS, threshold)
         capture = replace(capture, notes=capture.notes | known)

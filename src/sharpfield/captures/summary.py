@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from sharpfield.captures import llff_events
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_unposed
 from sharpfield.core.capture import Capture
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Frames
@@ -50,7 +50,7 @@ def summary(
         with open_events(path, unit=event_unit) as file:
             told = file if file.unit else replace(file, unit=_unit_of_layout(path))
             return {"kind": "events", "name": path.name, "events": file_summary(told)}
-    capture = read(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
+    capture = read_unposed(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
     return capture_summary(capture)
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures import native, write_evdnerf, write_llff_events
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_unposed
 from sharpfield.captures.summary import summary
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -206,7 +206,7 @@ def deblur(
         layout: Of the capture, if it is not recognised.
         options: Method, instants.
     """
-    deblur_to(read(capture, layout=layout), out, options)
+    deblur_to(read_unposed(capture, layout=layout), out, options)
     Console().print(f"Sharp frames are in {out}", highlight=False)
 
 
