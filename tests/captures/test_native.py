@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sharpfield.captures import native
-from sharpfield.core import Camera, Capture, EventStream, SiteColour, Split
+from sharpfield.core import Camera, Capture, DepthMaps, EventStream, SiteColour, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.trajectory import BSpline, LearnedKnots, Stamped, Still, Tracks
 
@@ -123,6 +123,11 @@ def variations(tiny: Capture) -> dict[str, Capture]:
             tiny,
             trajectory=Still(still(2)),
             events=replace(events[:0], track=np.zeros(0, np.uint16), tracks=2),
+        ),
+        "measured depth": replace(
+            tiny,
+            frames=replace(frames, names=("a/b", *"bcdefghi")),
+            depth=DepthMaps(deep[:, ::2, ::3, 0].copy(), Camera(4, 5, 3.7, 3.6, 2.0, 2.5), 0.002),
         ),
         "geometry": replace(
             tiny,

@@ -3,6 +3,7 @@
 capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes: to be read
 frames/NAME.png    8 or 16 bit, grey or RGB
 truth/NAME.png     sharp images at mid-exposure, where known
+depth/NAME.png     what a depth camera measured, 16 bit, if there was one
 events.h5          see `storage.event_writer`
 test_events.h5     likewise, of held-out cameras, if any
 truth/depth.npy, truth/flow.npy     of all frames, where known; see `Frames`
@@ -15,17 +16,17 @@ A capture that was just recorded has no poses yet. It is kept with a camera that
 the note `poses = "unknown"` says that this is only a stand-in.
 """
 
-import dataclasses
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
 from sharpfield.captures.folders import expect_replaceable
-from sharpfield.captures.native_frames import read_frames, write_frames
+from sharpfield.captures.native_camera import camera_table, read_camera
+from sharpfield.captures.native_depth import read_depth, write_depth
+from sharpfield.captures.native_frames import files_of, read_frames, write_frames
 from sharpfield.captures.native_trajectory import read_trajectory, write_trajectory
 from sharpfield.captures.toml_tables import Table, read_toml, toml_text
 from sharpfield.core.camera import Camera
@@ -75,7 +76,7 @@ def write(capture: Capture, folder: Path | str) -> None:
             "source": capture.source,
             "near": float(capture.near),
             "far": float(capture.far),
-            "camera": _camera_table(capture.camera),
+            "camera": camera_table(capture.camera),
             "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
             "trajectory": write_trajectory(capture.trajectory, fresh),
             "notes": {
@@ -89,6 +90,9 @@ def write(capture: Capture, folder: Path | str) -> None:
                 "encoding": capture.frames.encoding,
                 "each": write_frames(capture.frames, capture.split, fresh),
             }
+            if capture.depth is not None:
+                files = files_of(capture.frames.names)
+                about["depth"] = write_depth(capture.depth, files, fresh)
         if capture.events is not None:
             write_events(fresh / EVENTS, capture.events)
         if capture.test_events is not None:
@@ -140,14 +144,16 @@ def read_unposed(folder: Path) -> Capture:
     _expect_version(about)
     about.expect_only(
         *("format", "version", "name", "source", "near", "far", "camera", "clock"),
-        *("trajectory", "notes", "frames", "events"),
+        *("trajectory", "notes", "frames", "depth", "events"),
     )
     timing = about.table("clock")
     clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
-    camera = _camera(about.table("camera"))
-    frames, split = None, NO_SPLIT
+    camera = read_camera(about.table("camera"))
+    frames, split, depth = None, NO_SPLIT, None
     if "frames" in about.values:
-        frames, split = read_frames(about.table("frames"), folder)
+        frames, split, files = read_frames(about.table("frames"), folder)
+        if "depth" in about.values:
+            depth = read_depth(about.table("depth"), files, folder)
     notes = dict(about.table("notes", optional=True).values)
     if (folder / NOTES).exists():
         notes |= load_arrays(folder / NOTES)
@@ -167,6 +173,7 @@ def read_unposed(folder: Path) -> Capture:
         events=streams[0],
         test_events=streams[1],
         split=split,
+        depth=depth,
         points=load_array(folder / POINTS) if (folder / POINTS).exists() else None,
         name=about.text("name", folder.resolve().name),
         source=about.text("source", "native"),
@@ -208,25 +215,6 @@ def _expect_tracks(
                 where=where,
                 got=f"tracks {track.min()} to {track.max()}, {known} with poses",
             )
-
-
-def _camera_table(camera: Camera) -> dict[str, Any]:
-    table = dataclasses.asdict(camera)
-    return table | {"distortion": list(camera.distortion)}
-
-
-def _camera(table: Table) -> Camera:
-    table.expect_only(*(field.name for field in dataclasses.fields(Camera)))
-    return Camera(
-        width=table.whole("width"),
-        height=table.whole("height"),
-        fx_px=table.number("fx_px"),
-        fy_px=table.number("fy_px"),
-        cx_px=table.number("cx_px"),
-        cy_px=table.number("cy_px"),
-        lens=table.text("lens", "pinhole"),
-        distortion=table.numbers("distortion", []),
-    )
 
 
 def _expect_version(about: Table) -> None:

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from sharpfield.captures.images import describe, read_images, write_image
+from sharpfield.captures.images import describe, read_image, read_images, write_image
+from sharpfield.captures.mapped_images import mapped_images
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import CaptureError
@@ -45,7 +46,7 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
             raise CaptureError("a split must name frames in ascending order, each once", got=part)
     index = np.arange(len(frames))
     learned, held_out = np.isin(index, split.train), np.isin(index, split.test)
-    files = _file_names(frames.names)
+    files = files_of(frames.names)
     tables = []
     for i, file in enumerate(files):
         write_image(folder / FRAMES / file, frames.images[i])
@@ -70,8 +71,8 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
     return tables
 
 
-def read_frames(about: Table, folder: Path) -> tuple[Frames, Split]:
-    """Read what `write_frames` wrote.
+def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
+    """Read what `write_frames` wrote: the frames, their split, and the names of their files.
 
     Raises:
         CaptureError: A line or an image is missing or malformed, or images differ in size.
@@ -82,7 +83,7 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split]:
         table.expect_only(*KEYS)
     names = tuple(table.text("name") for table in tables)
     files = [_inside(table, folder) for table in tables]
-    images = read_images([folder / FRAMES / file for file in files])
+    images = mapped_images([folder / FRAMES / file for file in files], read_image, kind="frames")
     truth, known = _read_truth(tables, [folder / TRUTH / file for file in files], images)
     frames = Frames(
         images=images,
@@ -96,7 +97,7 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split]:
         truth_known=known,
         **_read_geometry(folder / TRUTH, images),
     )
-    return frames, _split(tables)
+    return frames, _split(tables), files
 
 
 def _read_truth(
@@ -105,16 +106,26 @@ def _read_truth(
     known = np.array([table.yes("truth", False) for table in tables])
     if not known.any():
         return None, None
-    truth = np.zeros_like(images)
+    if known.all():
+        truth = mapped_images(paths, read_image, kind="truth")
+        _expect_like(truth, images, paths[0].parent)
+        return truth, known
+    truth = np.zeros(images.shape, images.dtype)
     found = read_images([path for path, there in zip(paths, known, strict=True) if there])
+    _expect_like(found, images, paths[0].parent)
+    truth[known] = found
+    return truth, known
+
+
+def _expect_like(
+    found: Shaped[np.ndarray, "m y x c"], images: Shaped[np.ndarray, "n h w d"], where: Path
+) -> None:
     if found.shape[1:] != images.shape[1:] or found.dtype != images.dtype:
         raise CaptureError(
             "sharp images differ from the frames in size or type",
-            where=paths[0].parent,
+            where=where,
             got=f"{describe(found[0])}, frames {describe(images[0])}",
         )
-    truth[known] = found
-    return truth, known
 
 
 def _read_geometry(
@@ -155,7 +166,7 @@ def _split(tables: Sequence[Table]) -> Split:
     return Split(train=np.flatnonzero(learned), test=np.flatnonzero(held_out))
 
 
-def _file_names(names: Sequence[str]) -> list[str]:
+def files_of(names: Sequence[str]) -> list[str]:
     """The names themselves where every file system can hold them, else numbers."""
     different = len({name.casefold() for name in names}) == len(names)
     if different and all(PLAIN_NAME.fullmatch(name) for name in names):

@@ -14,12 +14,16 @@ import torch
 from sharpfield.captures import llff_events
 from sharpfield.captures.read import read_unposed
 from sharpfield.core.capture import Capture
+from sharpfield.core.depth import DepthMaps
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import count_tracks
 from sharpfield.storage.event_columns import polarity
 from sharpfield.storage.event_file import CHUNK, EventFile
 from sharpfield.storage.event_layouts import open_events
+
+DEPTH_SAMPLES = 16
+"""Depth maps that are looked into."""
 
 PATH_SAMPLES = 1000
 """Instants at which the length of a trajectory is measured."""
@@ -81,6 +85,8 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
     about["trajectory"] = _trajectory_summary(capture)
     about["bounds"] = {"near": capture.near, "far": capture.far}
     about["clock"] = {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us}
+    if capture.depth is not None:
+        about["depth"] = _depth_summary(capture.depth)
     about["points"] = 0 if capture.points is None else len(capture.points)
     about["notes"] = {
         key: f"array {note.shape}" if isinstance(note, np.ndarray) else note
@@ -190,6 +196,21 @@ def _frames_summary(frames: Frames) -> dict[str, Any]:
         "with_truth": with_truth,
         "with_depth": frames.depth is not None,
         "with_flow": frames.flow is not None,
+    }
+
+
+def _depth_summary(depth: DepthMaps) -> dict[str, Any]:
+    """How much of the maps is known, judged by a few of them."""
+    some = np.linspace(0, len(depth) - 1, min(len(depth), DEPTH_SAMPLES)).astype(int)
+    measured = np.stack([depth.at(int(frame)) for frame in some])
+    known = measured[measured > 0]
+    return {
+        "count": len(depth),
+        "width": depth.camera.width,
+        "height": depth.camera.height,
+        "unit": depth.unit,
+        "known_share": len(known) / measured.size,
+        "median": float(np.median(known)) if len(known) else None,
     }
 
 

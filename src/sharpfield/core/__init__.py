@@ -2,6 +2,7 @@
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.depth import DepthMaps
 from sharpfield.core.errors import (
     CaptureError,
     MissingExtra,
@@ -39,6 +40,7 @@ __all__ = [
     "Capture",
     "CaptureError",
     "Clock",
+    "DepthMaps",
     "EventPairs",
     "EventStream",
     "Exposure",

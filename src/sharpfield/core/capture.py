@@ -9,6 +9,7 @@ from jaxtyping import Float, Int64, Shaped
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
+from sharpfield.core.depth import DepthMaps
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Frames
@@ -67,6 +68,8 @@ class Capture:
     split: Split = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
     points: Float[np.ndarray, "m 3"] | None = None
     """Sparse scene points, where a reconstruction came with the capture."""
+    depth: DepthMaps | None = None
+    """What a depth camera measured, a map for each frame."""
     name: str = "capture"
     source: str = ""
     """The layout it was read from."""
@@ -86,6 +89,12 @@ class Capture:
         if self.frames is not None:
             self._frames_agree(self.frames)
             self._poses_cover(self.frames)
+        if self.depth is not None and len(self.depth) != len(self.frames or ()):
+            raise CaptureError(
+                "there must be one depth map for each frame",
+                where=self.name,
+                got=f"{len(self.depth)} maps, {len(self.frames or ())} frames",
+            )
 
     @cached_property
     def frame_time(self) -> Float[Tensor, "n 2"]:
@@ -116,6 +125,21 @@ class Capture:
             raise CaptureError("this needs events, and the capture has none", where=self.name)
         return self.events
 
+    @property
+    def needed_depth(self) -> DepthMaps:
+        """The depth maps.
+
+        Raises:
+            CaptureError: There are none.
+        """
+        if self.depth is None:
+            raise CaptureError(
+                "this needs measured depth, and the capture has none",
+                where=self.name,
+                do="take a capture of a depth camera, or one of `sharpfield simulate --scene room`",
+            )
+        return self.depth
+
     def frame_pose(self, frames: Int64[np.ndarray, "m"]) -> Float[Tensor, "m 3 4"]:
         """World-from-camera poses in the middle of the exposures of some frames."""
         held = self.needed_frames
@@ -127,6 +151,7 @@ class Capture:
         return replace(
             self,
             frames=None if frames else self.frames,
+            depth=None if frames else self.depth,
             events=None if events else self.events,
             test_events=None if events else self.test_events,
         )

@@ -54,12 +54,16 @@ def moved(capture: Capture, change: Similarity) -> Capture:
     frames = capture.frames
     if frames is not None and frames.depth is not None:
         frames = dataclasses.replace(frames, depth=frames.depth * np.float32(change.scale))
+    depth = capture.depth
+    if depth is not None:
+        depth = dataclasses.replace(depth, unit=depth.unit * change.scale)
     return dataclasses.replace(
         capture,
         trajectory=Moved(capture.trajectory, change),
         near=capture.near * change.scale,
         far=capture.far * change.scale,
         frames=frames,
+        depth=depth,
         points=None if capture.points is None else change.points(capture.points),
     )
 

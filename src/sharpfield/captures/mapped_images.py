@@ -1,0 +1,86 @@
+"""Images larger than memory: decoded once beside the capture, memory-mapped ever after.
+
+A step of training looks at a few frames of thousands, and decoding them again each time would cost
+more than the step. So the images of a long recording are decoded once, in parallel, into one
+`.npy` in the capture's cache folder, and read from there as if they were in memory; the system
+keeps of it what is in use. Short recordings are simply loaded. Derived: delete it when you like.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from sharpfield.captures.event_cache import cache_folder
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.files import replacing
+
+IN_MEMORY = 256_000_000
+"""Up to this many bytes of images are loaded, more are mapped."""
+
+Stack = Shaped[np.ndarray, "n ..."]
+Pixels = Shaped[np.ndarray, "..."]
+Decode = Callable[[Path], Pixels]
+"""The pixels of a file."""
+
+
+def mapped_images(
+    paths: Sequence[Path], decode: Decode, *, kind: str, in_memory: int = IN_MEMORY
+) -> Stack:
+    """All images as one array; memory-mapped, read only, if there are many.
+
+    Args:
+        paths: Files, at least one.
+        decode: How to read one; all must come out in one shape and type.
+        kind: What they are and how they were decoded, e.g. "colour 640x480": part of the cache's
+            name.
+        in_memory: How many bytes may be loaded.
+
+    Raises:
+        CaptureError: There are none, one cannot be read, or they differ in shape or type.
+    """
+    if not paths:
+        raise CaptureError("there are no images to read")
+    first = decode(paths[0])
+    shape = (len(paths), *first.shape)
+    if first.nbytes * len(paths) <= in_memory:
+        images = np.empty(shape, first.dtype)
+        _fill(images, paths, decode, first)
+        return images
+    place = cache_folder(paths[0].parent) / f"images-{_key(paths, kind)}.npy"
+    if not place.exists():
+        with replacing(place) as temporary:
+            images = np.lib.format.open_memmap(temporary, "w+", first.dtype, shape)
+            _fill(images, paths, decode, first)
+            images.flush()
+    return np.load(place, mmap_mode="r")
+
+
+def _fill(images: Stack, paths: Sequence[Path], decode: Decode, first: Pixels) -> None:
+    def place(i: int) -> None:
+        image = decode(paths[i]) if i else first
+        if image.shape != first.shape or image.dtype != first.dtype:
+            raise CaptureError(
+                "images differ in size or type",
+                where=f"{paths[0]} and {paths[i]}",
+                got=f"{first.shape} {first.dtype} and {image.shape} {image.dtype}",
+                do="a capture has one camera: bring all images to one size, bit depth and colour",
+            )
+        images[i] = image
+
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+        for _ in pool.map(place, range(len(paths))):
+            pass
+
+
+def _key(paths: Sequence[Path], kind: str) -> str:
+    """Changes when a file is added, removed or written again."""
+    digest = hashlib.blake2b(kind.encode(), digest_size=10)
+    for path in paths:
+        about = path.stat()
+        digest.update(f"{path.name}/{about.st_size}/{about.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
