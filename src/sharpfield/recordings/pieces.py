@@ -1,0 +1,182 @@
+"""Pieces of events, as files happen to have them, joined to chunks that are sound.
+
+A file comes in packets, messages or blocks, of a few events or of millions. A reader turns each
+into a `Piece` and leaves the rest to `joined`, which drops and counts what cannot be (events
+outside the sensor, or earlier than those before them) and hands on chunks of one size.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Int8, Int64, UInt16
+from numba import njit
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.recordings.recording import Chunks, Trouble
+
+CHUNK = 2**20
+"""Events in a chunk; the last one has fewer."""
+
+BACK_EVENTS, BACK_SHARE = 100, 0.01
+"""Some cameras now and then deliver an event late. More than this many, and more than this share
+of all, mean that the file is not in the order of time at all."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Consecutive events, not looked at yet."""
+
+    x: UInt16[np.ndarray, "n"]
+    y: UInt16[np.ndarray, "n"]
+    t_us: Int64[np.ndarray, "n"]
+    p: Int8[np.ndarray, "n"]
+    """-1 darker, +1 brighter."""
+
+    def __len__(self) -> int:
+        """Number of events."""
+        return len(self.t_us)
+
+    def __getitem__(self, part: slice | np.ndarray) -> "Piece":
+        """A slice as views, or a choice as copies."""
+        return Piece(self.x[part], self.y[part], self.t_us[part], self.p[part])
+
+
+def joined(
+    pieces: Iterator[Piece], size: tuple[int, int], *, where: object, trouble: Trouble
+) -> Chunks:
+    """Sound chunks of `CHUNK` events, made of pieces of any size.
+
+    Args:
+        pieces: In the order of the file.
+        size: Width and height of the sensor.
+        where: The file, for messages.
+        trouble: Is told what was dropped.
+
+    Raises:
+        CaptureError: The events are not in the order of time.
+    """
+    gate = _Gate(size, where, trouble)
+    waiting: list[Piece] = []
+    count = 0
+    for piece in pieces:
+        sound = gate.passed(piece)
+        waiting.append(sound)
+        count += len(sound)
+        if count < CHUNK:
+            continue
+        whole = _together(waiting)
+        for first in range(0, count - CHUNK + 1, CHUNK):
+            yield _stream(whole[first : first + CHUNK], size)
+        waiting, count = [whole[count - count % CHUNK :]], count % CHUNK
+    if count:
+        yield _stream(_together(waiting), size)
+
+
+def known_size(
+    stated: tuple[int, int] | None, given: tuple[int, int] | None, where: object
+) -> tuple[int, int]:
+    """Width and height of the sensor, from the file or from the caller.
+
+    Raises:
+        CaptureError: Neither says, or they contradict each other, or it is no size.
+    """
+    size = stated or given
+    if size is None:
+        raise CaptureError(
+            "the file does not say how large the sensor is",
+            where=where,
+            do="give width and height, e.g. size 346 260",
+        )
+    if not (0 < size[0] <= 2**15 and 0 < size[1] <= 2**15):
+        raise CaptureError("no sensor has this size", where=where, got=f"{size[0]} x {size[1]}")
+    if stated and given and stated != given:
+        raise CaptureError(
+            "the size given is not the one in the file",
+            where=where,
+            got=f"{given[0]} x {given[1]} given, {stated[0]} x {stated[1]} in the file",
+            do="leave the size out",
+        )
+    return size
+
+
+class _Gate:
+    """Lets through what lies on the sensor and does not go back in time."""
+
+    def __init__(self, size: tuple[int, int], where: object, trouble: Trouble) -> None:
+        self._size, self._where, self._trouble = size, where, trouble
+        self._last_us = np.iinfo(np.int64).min
+        self._seen = self._back = 0
+
+    def passed(self, piece: Piece) -> Piece:
+        """The sound events of the next piece."""
+        outside, back = _faults(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
+        if outside or back:
+            keep = _sound(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
+            self._note(piece, outside, back, keep)
+            piece = piece[keep]
+        self._seen += len(piece)
+        if len(piece):
+            self._last_us = int(piece.t_us[-1])
+        return piece
+
+    def _note(self, piece: Piece, outside: int, back: int, keep: np.ndarray) -> None:
+        self._trouble.note("events outside the sensor", outside)
+        self._trouble.note("events earlier than those before them", back)
+        self._back += back
+        if self._back > max(BACK_EVENTS, BACK_SHARE * (self._seen + len(piece))):
+            kept = np.flatnonzero(keep)
+            late = int(np.flatnonzero(~keep & (piece.t_us < self._last_us))[-1:].sum())
+            before = kept[kept < late]
+            latest = int(piece.t_us[before[-1]]) if len(before) else self._last_us
+            raise CaptureError(
+                "event times are not ascending",
+                where=self._where,
+                got=f"event {self._seen + late} at {piece.t_us[late]} us after {latest} us,"
+                f" {self._back:,} such events so far",
+                do="sort the events by time (stable), and check that clock wraps were undone",
+            )
+
+
+def _together(pieces: list[Piece]) -> Piece:
+    if len(pieces) == 1:
+        return pieces[0]
+    return Piece(
+        x=np.concatenate([piece.x for piece in pieces]),
+        y=np.concatenate([piece.y for piece in pieces]),
+        t_us=np.concatenate([piece.t_us for piece in pieces]),
+        p=np.concatenate([piece.p for piece in pieces]),
+    )
+
+
+def _stream(piece: Piece, size: tuple[int, int]) -> EventStream:
+    return EventStream(piece.x, piece.y, piece.t_us, piece.p, width=size[0], height=size[1])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _faults(x, y, t_us, width, height, last_us):
+    """How many events lie outside, and how many inside are earlier than one before."""
+    outside = back = 0
+    for i in range(t_us.size):
+        if x[i] >= width or y[i] >= height:
+            outside += 1
+        elif t_us[i] < last_us:
+            back += 1
+        else:
+            last_us = t_us[i]
+    return outside, back
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _sound(x, y, t_us, width, height, last_us):
+    """Which events are neither."""
+    keep = np.zeros(t_us.size, np.bool_)
+    for i in range(t_us.size):
+        if x[i] < width and y[i] < height and t_us[i] >= last_us:
+            keep[i] = True
+            last_us = t_us[i]
+    return keep

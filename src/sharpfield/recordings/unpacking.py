@@ -1,0 +1,73 @@
+"""Compressed blocks of a file, unpacked without trusting what they say of themselves."""
+
+import bz2
+from collections.abc import Callable
+from typing import Any
+
+from sharpfield.core.extras import need
+
+LIMIT = 2**28
+"""No sound block is larger once unpacked (16 million events)."""
+
+
+class Damaged(ValueError):
+    """A part of a file is not what it should be; whoever reads the file skips it and counts."""
+
+
+def unpacked(data: bytes, packing: str) -> bytes:
+    """The block itself.
+
+    Args:
+        data: One whole frame.
+        packing: "none", "bz2", "lz4" (frames, not bare blocks) or "zstd".
+
+    Raises:
+        Damaged: It is torn, wrong, or larger than `LIMIT`; or no such packing is known.
+        MissingExtra: The package that unpacks it is not installed.
+    """
+    if packing not in _UNPACK:
+        raise Damaged(f"packing {packing!r}")
+    return _UNPACK[packing](data)
+
+
+def _none(data: bytes) -> bytes:
+    return data
+
+
+def _bz2(data: bytes) -> bytes:
+    return _limited(bz2.BZ2Decompressor(), data, OSError)
+
+
+def _lz4(data: bytes) -> bytes:
+    frame: Any = need("lz4.frame", extra="io", purpose="reading a recording packed with LZ4")
+    return _limited(frame.LZ4FrameDecompressor(), data, RuntimeError)
+
+
+def _zstd(data: bytes) -> bytes:
+    zstd: Any = need("zstandard", extra="io", purpose="reading a recording packed with Zstandard")
+    try:
+        with zstd.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as reader:
+            found = reader.read(LIMIT + 1)
+    except zstd.ZstdError as error:
+        raise Damaged(str(error)) from None
+    if not found or len(found) > LIMIT:
+        raise Damaged(f"{len(found)} bytes unpacked")
+    return found
+
+
+def _limited(decompressor: Any, data: bytes, failure: type[Exception]) -> bytes:
+    try:
+        found = decompressor.decompress(data, max_length=LIMIT)
+    except (failure, EOFError) as error:
+        raise Damaged(str(error)) from None
+    if not decompressor.eof:
+        raise Damaged("a torn block")
+    return found
+
+
+_UNPACK: dict[str, Callable[[bytes], bytes]] = {
+    "none": _none,
+    "bz2": _bz2,
+    "lz4": _lz4,
+    "zstd": _zstd,
+}
