@@ -97,9 +97,15 @@ def coordinates(stored: Stored, name: str, where: object) -> Stored:
 
 
 class ZippedColumn:
-    """One array of an npz archive, read piece by piece, so that it need not fit in memory."""
+    """One array of an npz archive, read piece by piece, so that it need not fit in memory.
 
-    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
+    Args:
+        archive: The npz file.
+        name: Of the array's member, with `.npy`.
+        axes: How many the array must have: 2 for a table, whose rows are the pieces.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile, name: str, axes: int = 1) -> None:
         self._file = archive.open(name)
         where = f"{archive.filename}, {name}"
         version = np.lib.format.read_magic(self._file)
@@ -109,28 +115,38 @@ class ZippedColumn:
             header = np.lib.format.read_array_header_2_0(self._file)
         else:
             raise CaptureError("unknown version of the npy format", where=where, got=version)
-        self.shape, _, self.dtype = header
+        self.shape, by_column, self.dtype = header
         if self.dtype.hasobject:
             raise CaptureError(
                 "array holds pickled Python objects, which may run code when loaded",
                 where=where,
                 do="save it as plain numbers: np.savez(path, t=t.astype(np.int64), ...)",
             )
-        if len(self.shape) != 1 or self.dtype.kind not in "iufb":
+        if len(self.shape) != axes or self.dtype.kind not in "iufb" or (by_column and axes > 1):
+            dimensions = "one-dimensional" if axes == 1 else f"{axes}-dimensional, row by row"
             raise CaptureError(
-                "an event column must be a one-dimensional array of numbers",
+                f"an event column must be a {dimensions} array of numbers",
                 where=where,
                 got=f"shape {self.shape}, {self.dtype}",
             )
         self._start = self._file.tell()
+        self._row = int(np.prod(self.shape[1:])) * self.dtype.itemsize
+        told, holds = self._start + len(self) * self._row, archive.getinfo(name).file_size
+        if told != holds:
+            raise CaptureError(
+                "array is shorter or longer than it says",
+                where=where,
+                got=f"{holds} bytes instead of {told}",
+                do="the file may be damaged: copy or convert it again",
+            )
 
     def __len__(self) -> int:
-        """Stored of entries."""
+        """Number of entries."""
         return self.shape[0]
 
     def __getitem__(self, part: slice) -> Stored:
         """Entries `part.start` to `part.stop`."""
         first, last, _ = part.indices(len(self))
-        self._file.seek(self._start + first * self.dtype.itemsize)
-        data = self._file.read(max(last - first, 0) * self.dtype.itemsize)
-        return np.frombuffer(data, self.dtype)
+        self._file.seek(self._start + first * self._row)
+        data = self._file.read(max(last - first, 0) * self._row)
+        return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])

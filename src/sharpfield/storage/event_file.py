@@ -1,6 +1,7 @@
 """A file of events that is open but not loaded: any window of time, any part, chunk by chunk."""
 
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -20,6 +21,10 @@ CHUNK = 2**20
 
 SEARCHED = 2**16
 """Times unpacked at once when looking for one: an HDF5 chunk or so."""
+
+
+UNREADABLE = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error)
+"""What reading a part of a damaged file may end in."""
 
 
 @runtime_checkable
@@ -68,7 +73,7 @@ class EventFile:
         self.resources.close()
 
     def __len__(self) -> int:
-        """Stored of events."""
+        """Number of events."""
         return len(self.columns["t"])
 
     def part(self, first: int, last: int) -> EventStream:
@@ -132,7 +137,7 @@ class EventFile:
         return int(self._times(0, 1)[0]), int(self._times(len(self) - 1, len(self))[0])
 
     def first_at(self, time_us: int) -> int:
-        """Stored of the first event at or after a time; the count of events if there is none."""
+        """Number of the first event at or after a time; the count of events if there is none."""
         low, high = 0, len(self)
         if self.ms_to_idx is not None and len(self.ms_to_idx):
             ms = (time_us - self.offset_us) // 1000
@@ -157,7 +162,7 @@ class EventFile:
         """
         try:
             return self.columns[name][first:last]
-        except (OSError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise CaptureError(
                 "cannot read events",
                 where=f"{self.path}, column {name}, events {first} to {last - 1}",

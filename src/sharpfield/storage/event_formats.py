@@ -1,7 +1,7 @@
 """Writing events in the format that a file's name asks for, in as many pieces as you like.
 
     .h5     our own, see `storage.event_writer`: it says its units and its sensor
-    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and width, height
+    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
     .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
 
 Whatever the format, the file appears whole, at the end, or not at all.
@@ -67,9 +67,9 @@ def _arrays(path: Path, like: EventStream) -> Iterator[Append]:
         "t": np.concatenate([part.t_us for part in parts]),
         "p": np.concatenate([part.p for part in parts]),
     }
-    size = {"width": np.array(like.width), "height": np.array(like.height)}
+    about = {"tick_ns": 1000, "width": like.width, "height": like.height}
     with replacing(path) as temporary:
-        write_arrays(temporary, columns | size)
+        write_arrays(temporary, columns | {name: np.array(told) for name, told in about.items()})
 
 
 @contextmanager

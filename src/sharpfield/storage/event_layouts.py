@@ -5,7 +5,8 @@
 - Ours: a superset of it, written by `storage.event_writer`. Attributes give the sensor's size and
   the unit; any tool that reads DSEC reads it.
 - Flat: HDF5 or npz with `x, y, t, p` at the root (EDS, Ev-DeblurNeRF, vid2e). It says neither
-  the unit of its times nor the size of the sensor, so the caller must.
+  the unit of its times nor the size of the sensor, so the caller must; an npz of ours says both,
+  as arrays `tick_ns`, `width` and `height`.
 
 Source: Gehrig et al., *DSEC* (RA-L 2021), for the layout; the rest from files as published.
 """
@@ -25,7 +26,7 @@ import numpy as np
 from sharpfield.core.errors import CaptureError, MissingExtra
 from sharpfield.core.events import SiteColour
 from sharpfield.storage.event_columns import ZippedColumn, known_unit, whole_us
-from sharpfield.storage.event_file import EventFile
+from sharpfield.storage.event_file import UNREADABLE, EventFile
 
 COLUMNS = ("x", "y", "t", "p")
 TRACK = "track"
@@ -39,6 +40,10 @@ THRESHOLDS = ("threshold_off", "threshold_on")
 
 BLOSC, PROPHESEE_ECF = 32001, 0x8ECF
 """Numbers of HDF5 compression filters that need a plugin."""
+
+
+UNREADABLE_NPZ = (*UNREADABLE, KeyError, NotImplementedError, RuntimeError)
+"""What opening a damaged archive may end in: also no such member, unknown packing, a password."""
 
 
 def open_events(
@@ -82,12 +87,28 @@ def _open_npz(path: Path) -> EventFile:
             archive = resources.enter_context(zipfile.ZipFile(path))
             _expect_columns([name.removesuffix(".npy") for name in archive.namelist()], path)
             columns = {name: ZippedColumn(archive, f"{name}.npy") for name in COLUMNS}
-        except (zipfile.BadZipFile, ValueError) as error:
+            tick, *size = (_number(archive, name) for name in ("tick_ns", "width", "height"))
+        except UNREADABLE_NPZ as error:
             raise CaptureError(
                 "not a readable npz file", where=path, got=error, do="copy or write it again"
             ) from None
-        return EventFile(path, columns, unit=None, size=None, resources=resources.pop_all())
+        return EventFile(
+            path,
+            columns,
+            unit=TICKS.get(tick),
+            size=(size[0], size[1]) if all(size) else None,
+            resources=resources.pop_all(),
+        )
     raise AssertionError("the block above returns or raises")
+
+
+def _number(archive: zipfile.ZipFile, name: str) -> int:
+    """A whole number that an npz file may hold; 0 if it does not."""
+    if f"{name}.npy" not in archive.namelist():
+        return 0
+    with archive.open(f"{name}.npy") as member:
+        stored = np.lib.format.read_array(member, allow_pickle=False)
+    return int(stored) if stored.shape == () and stored.dtype.kind in "iu" else 0
 
 
 def _open_hdf5(path: Path) -> EventFile:

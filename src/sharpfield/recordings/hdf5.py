@@ -1,0 +1,264 @@
+"""HDF5 files of events, as data sets and programs lay them out.
+
+    DSEC, TUM-VIE, ours      events/{x, y, t, p}, and what `storage.event_layouts` tells; us
+    EDS, Ev-DeblurNeRF       {x, y, t, p} at the root; the unit is not told
+    M3ED                     prophesee/{left, right}/{x, y, t, p}; us
+    E2VID, event_utils       events/{xs, ys, ts, ps}; s; images/image%09d with a time each
+    MVSEC                    davis/{left, right}/events, rows x, y, t, p; s; image_raw, image_raw_ts
+    v2e                      events, rows t, x, y, p; us
+
+Where a file holds several cameras, the caller names one. Frames of these files have one time each;
+how long the shutter was open they do not tell.
+
+Source: Gehrig et al., *DSEC* (RA-L 2021); Klenk et al., *TUM-VIE* (IROS 2021); Chaney et al.,
+*M3ED* (CVPRW 2023); Stoffregen et al., *Reducing the Sim-to-Real Gap for Event Cameras* (ECCV
+2020); Zhu et al., *MVSEC* (RA-L 2018); Hu et al., *v2e* (CVPRW 2021).
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.columns import recording_of
+from sharpfield.recordings.recording import Frame, Recording
+from sharpfield.storage.event_columns import known_unit, whole_us
+from sharpfield.storage.event_file import EventFile
+from sharpfield.storage.event_layouts import compression_plugin, open_events
+
+CAMERA = "*"
+"""Stands in a path for the name of one of several cameras."""
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """Where a kind of file keeps what it holds."""
+
+    layout: str
+    events: str
+    """Path of the group of columns, or of the table."""
+    columns: tuple[str, ...]
+    """Names of x, y, t, p in the group; or what the columns of the table are, in their order."""
+    unit: str
+    size: Callable[[h5py.File, str], tuple[int, int] | None] = lambda file, camera: None
+    """How the file tells the size of its sensor."""
+    frames: Callable[[h5py.File, str], Iterator[Frame]] | None = None
+    first_frame: str = ""
+    """Path that is there if frames are."""
+
+    @property
+    def table(self) -> bool:
+        """Whether events are rows of one table."""
+        return self.columns[0] in ("xytp", "txyp")
+
+    def cameras(self, file: h5py.File) -> list[str]:
+        """The cameras whose events the file keeps in this way; [""] if there is no choice."""
+        before, star, after = self.events.partition(f"{CAMERA}/")
+        if not star:
+            return [""] if self._holds(file.get(self.events)) else []
+        group = file.get(before.rstrip("/"))
+        if not isinstance(group, h5py.Group):
+            return []
+        return [name for name in group if self._holds(file.get(f"{before}{name}/{after}"))]
+
+    def at(self, camera: str) -> str:
+        """Path of the events of a camera."""
+        return self.events.replace(CAMERA, camera).rstrip("/")
+
+    def _holds(self, found: Any) -> bool:
+        if self.table:
+            return isinstance(found, h5py.Dataset) and found.ndim == 2 and found.shape[1] == 4
+        return isinstance(found, h5py.Group) and set(self.columns) <= set(found)
+
+
+class TableColumn:
+    """One column of a table, read piece by piece."""
+
+    def __init__(self, table: h5py.Dataset, column: int) -> None:
+        self._table, self._column = table, column
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return self._table.shape[0]
+
+    def __getitem__(self, part: slice) -> np.ndarray:
+        """Entries `part.start` to `part.stop`."""
+        return self._table[part, self._column]
+
+
+def open_hdf5(
+    path: Path,
+    *,
+    unit: str | None = None,
+    size: tuple[int, int] | None = None,
+    topic: str | None = None,
+) -> Recording:
+    """Open an HDF5 file of events.
+
+    Args:
+        path: The file.
+        unit: Of its times (ns, us, ms, s), where it does not say.
+        size: Width and height of the sensor, where it does not say.
+        topic: Which of several cameras, e.g. "left".
+
+    Raises:
+        CaptureError: It holds no events in a known layout, or does not say its unit or size.
+    """
+    with _opened(path) as file:
+        found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
+    if not found:
+        return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
+    dialect, camera = _chosen(found, topic, path)
+
+    def open_file() -> EventFile:
+        return _event_file(path, dialect, camera, unit, size)
+
+    made = recording_of(dialect.layout, path, open_file)
+    with _opened(path) as file:
+        has_frames = dialect.first_frame.replace(CAMERA, camera) in file
+    if dialect.frames is None or not dialect.first_frame or not has_frames:
+        return made
+    read = dialect.frames
+
+    def frames() -> Iterator[Frame]:
+        with _opened(path) as file:
+            yield from read(file, camera)
+
+    return replace(made, frames=frames)
+
+
+def _chosen(found: list[tuple[Dialect, str]], topic: str | None, path: Path) -> tuple[Dialect, str]:
+    if topic is None and len(found) == 1:
+        return found[0]
+    named = [pair for pair in found if pair[1] == topic]
+    if len(named) == 1:
+        return named[0]
+    raise CaptureError(
+        "the file holds several cameras" if topic is None else "the file has no such camera",
+        where=path,
+        got=", ".join(camera for _, camera in found) if topic is None else topic,
+        do="choose a topic: " + ", ".join(camera or "none" for _, camera in found),
+    )
+
+
+def _event_file(
+    path: Path, dialect: Dialect, camera: str, unit: str | None, size: tuple[int, int] | None
+) -> EventFile:
+    with ExitStack() as resources:
+        file = resources.enter_context(_opened(path))
+        held = file[dialect.at(camera)]
+        if dialect.table:
+            order = dialect.columns[0]
+            columns = {name: TableColumn(held, order.index(name)) for name in "xytp"}
+        else:
+            columns = {
+                name: _column(held, dialect.columns[i], path) for i, name in enumerate("xytp")
+            }
+        if len({len(column) for column in columns.values()}) != 1:
+            raise CaptureError(
+                "event columns have different lengths",
+                where=path,
+                got=", ".join(f"{name} {len(column)}" for name, column in columns.items()),
+                do="the file may be truncated: copy or convert it again",
+            )
+        return EventFile(
+            path,
+            columns,
+            unit=known_unit(unit) if unit else dialect.unit,
+            size=size or dialect.size(file, camera),
+            resources=resources.pop_all(),
+        )
+    raise AssertionError("the block above returns or raises")
+
+
+def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
+    column = group[name]
+    if isinstance(column, h5py.Dataset) and column.ndim == 1 and column.dtype.kind in "iufb":
+        return column
+    raise CaptureError(
+        "an event column must be a one-dimensional array of numbers",
+        where=f"{path}, {group.name}/{name}",
+        got=column,
+    )
+
+
+def _opened(path: Path) -> h5py.File:
+    compression_plugin()  # makes more compression filters known to HDF5
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise CaptureError(
+            "cannot open the event file: it is missing, truncated, or not HDF5",
+            where=path,
+            got=error,
+            do="copy or convert it again",
+        ) from None
+
+
+def _m3ed_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
+    stored = file.get(f"prophesee/{camera}/calib/resolution")
+    if not isinstance(stored, h5py.Dataset) or stored.shape != (2,):
+        return None
+    width, height = (int(pixels) for pixels in stored[:])
+    return width, height
+
+
+def _attribute_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
+    """`sensor_resolution` is height and width."""
+    stored = np.asarray(file.attrs.get("sensor_resolution", ())).ravel()
+    if len(stored) != 2 or stored.dtype.kind not in "iuf":
+        return None
+    return int(stored[1]), int(stored[0])
+
+
+def _mvsec_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
+    """The frames come from the pixels of the same sensor."""
+    stored = file.get(f"davis/{camera}/image_raw")
+    if not isinstance(stored, h5py.Dataset) or stored.ndim != 3:
+        return None
+    return stored.shape[2], stored.shape[1]
+
+
+def _mvsec_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
+    images, times = (file[f"davis/{camera}/{name}"] for name in ("image_raw", "image_raw_ts"))
+    times_us = whole_us(times[:], "s", file.filename)
+    for image, t_us in zip(images, times_us.tolist(), strict=False):
+        yield Frame(image, t_us, t_us)
+
+
+def _numbered_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
+    for name in sorted(file["images"]):
+        image = file["images"][name]
+        stamp = np.asarray(image.attrs.get("timestamp", np.nan), np.float64).reshape(-1)[:1]
+        t_us = int(whole_us(stamp, "s", f"{file.filename}, images/{name}")[0])
+        yield Frame(image[:], t_us, t_us, name)
+
+
+DIALECTS = (
+    Dialect("M3ED", f"prophesee/{CAMERA}/", ("x", "y", "t", "p"), "us", _m3ed_size),
+    Dialect(
+        "event_utils HDF5",
+        "events",
+        ("xs", "ys", "ts", "ps"),
+        "s",
+        _attribute_size,
+        _numbered_frames,
+        "images",
+    ),
+    Dialect(
+        "MVSEC",
+        f"davis/{CAMERA}/events",
+        ("xytp",),
+        "s",
+        _mvsec_size,
+        _mvsec_frames,
+        f"davis/{CAMERA}/image_raw_ts",
+    ),
+    Dialect("v2e HDF5", "events", ("txyp",), "us"),
+)
+"""Ways to lay events out that `storage.open_events` does not know."""
