@@ -1,0 +1,278 @@
+"""Frames alone: a video file, or a folder of pictures with a text that says when they were taken.
+
+A video tells when each frame is to be shown, which is when it was taken unless it is slow motion:
+then the caller says how many were taken per second. For a folder, times come from one of
+
+    images.txt                       RPG: a line `t path` for each, t in s
+    *exposure*.txt                   DSEC: `start, end`; or a file of starts and one of ends (EVDI)
+    *timestamp*.txt, *times*.txt     a time a line
+    timestamps.npz                   Ev-DeblurNeRF: `timestamps_start`, `timestamps_end`
+
+beside the pictures or in the folder above. Only RPG's text implies a unit; the caller names that
+of the others, unless their header does.
+
+Source: Mueggler et al., *The Event-Camera Dataset and Simulator* (IJRR 2017), for `images.txt`;
+the others from data sets as published.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.recording import Frame, Recording, Trouble
+from sharpfield.storage.arrays import load_arrays
+from sharpfield.storage.event_columns import UNITS, known_unit, whole_us
+from sharpfield.storage.images import list_images, read_image
+
+FASTEST = 1e6
+"""Frames per second: times are whole us."""
+
+TOLD = re.compile(r"\b(ns|us|ms|s)\b|_(ns|us|ms|s)\b|\[(ns|us|ms|s)\]")
+"""How a header names a unit."""
+
+Times = tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]
+"""When each exposure begins and ends, in us; the same where only one time is known."""
+
+
+def open_video(path: Path, *, per_second: float | None = None) -> Recording:
+    """Open a video.
+
+    Args:
+        path: Anything that FFmpeg decodes.
+        per_second: How many frames were taken per second, where that is not how it is shown.
+
+    Raises:
+        CaptureError: It cannot be decoded, or holds no video.
+    """
+    interval_us = None if per_second is None else 1e6 / _rate(per_second)
+    trouble = Trouble()
+    first = next(_decoded(path, interval_us, Trouble()), None)
+    if first is None:
+        raise CaptureError("the video holds no frames", where=path, do="copy or convert it again")
+    return Recording(
+        path,
+        "video",
+        frames=lambda: _decoded(path, interval_us, trouble),
+        trouble=trouble,
+        notes={"encoding": "srgb", "frame_size": f"{first.image.shape[1]}x{first.image.shape[0]}"},
+    )
+
+
+def open_images(
+    path: Path,
+    *,
+    unit: str | None = None,
+    per_second: float | None = None,
+    times: Path | None = None,
+) -> Recording:
+    """Open a folder of pictures.
+
+    Args:
+        path: The folder; or one that has the pictures in `images/`, and `images.txt`.
+        unit: Of the times (ns, us, ms, s), where the text does not say.
+        per_second: How many were taken per second, where no text says when.
+        times: The file that says when, where there are several.
+
+    Raises:
+        CaptureError: There are no pictures, or nothing says when they were taken.
+    """
+    listed = path / "images.txt"
+    if times is None and per_second is None and listed.is_file():
+        files, (opens, closes) = _rpg(listed)
+    else:
+        files = list_images(path) or (
+            list_images(path / "images") if (path / "images").is_dir() else []
+        )
+        if not files:
+            raise CaptureError("no pictures found", where=path, do="put PNG or JPEG files there")
+        opens, closes = _times(files, unit, per_second, times)
+    if len(opens) != len(files):
+        raise CaptureError(
+            "there must be one time for each picture",
+            where=path,
+            got=f"{len(files)} pictures, {len(opens)} times",
+        )
+
+    def frames() -> Iterator[Frame]:
+        for file, open_us, close_us in zip(files, opens.tolist(), closes.tolist(), strict=True):
+            yield Frame(read_image(file), open_us, close_us, file.stem)
+
+    return Recording(path, "pictures", frames=frames, notes={"encoding": "srgb"})
+
+
+def _decoded(path: Path, interval_us: float | None, trouble: Trouble) -> Iterator[Frame]:
+    """Frames of a video, as far as it can be decoded."""
+    count = 0
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise CaptureError("the file holds no video", where=path)
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            for frame in container.decode(stream):
+                if interval_us is not None:
+                    t_us = round(count * interval_us)
+                elif frame.pts is None or frame.time_base is None:
+                    raise CaptureError(
+                        "the video does not say when its frames were taken",
+                        where=f"{path}, frame {count}",
+                        do="give how many were taken per second",
+                    )
+                else:
+                    t_us = round(frame.pts * frame.time_base * 1_000_000)
+                yield Frame(_pixels(frame), t_us, t_us, f"{count:06d}")
+                count += 1
+    except av.FFmpegError as error:
+        if not count:
+            raise CaptureError(
+                "not a video that can be decoded", where=path, got=error, do="convert it again"
+            ) from None
+        trouble.note("torn ends of videos")
+
+
+def _pixels(frame: av.VideoFrame) -> Shaped[np.ndarray, "h w *c"]:
+    """Grey as it is, all else as RGB; more than 8 bits stay 16."""
+    deep = any(component.bits > 8 for component in frame.format.components)
+    if len(frame.format.components) == 1 and not frame.format.is_bayer:
+        return frame.to_ndarray(format="gray16le" if deep else "gray")
+    return frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+
+
+def _times(
+    files: list[Path], unit: str | None, per_second: float | None, times: Path | None
+) -> Times:
+    if per_second is not None:
+        instants = np.rint(np.arange(len(files)) * (1e6 / _rate(per_second))).astype(np.int64)
+        return instants, instants
+    folder = files[0].parent
+    sources = [(times,)] if times is not None else _candidates(folder)
+    if len(sources) != 1:
+        raise CaptureError(
+            "nothing says when the pictures were taken"
+            if not sources
+            else "several files may say when the pictures were taken",
+            where=folder,
+            got=", ".join(path.name for source in sources for path in source),
+            do="give how many were taken per second, or the file of times"
+            if not sources
+            else "name one of them as the file of times",
+        )
+    return _read_times(sources[0], unit)
+
+
+def _candidates(folder: Path) -> list[tuple[Path, ...]]:
+    """Files that may say when the pictures of a folder were taken; starts and ends are two."""
+    for place in (folder, folder.parent):
+        texts = [path for path in sorted(place.glob("*.txt")) if path.name != "images.txt"]
+        named = [path for path in texts if re.search("exposure|timestamp|times", path.name, re.I)]
+        starts = [path for path in named if re.search("start", path.name, re.I)]
+        ends = [path for path in named if re.search("end", path.name, re.I)]
+        if len(starts) == len(ends) == 1 and starts != ends:
+            return [(starts[0], ends[0])]
+        exposures = [path for path in named if re.search("exposure", path.name, re.I)]
+        arrays = [path for path in (place / "timestamps.npz",) if path.is_file()]
+        if exposures or named or arrays:
+            return [(path,) for path in [*(exposures or named), *arrays]]
+    return []
+
+
+def _read_times(source: tuple[Path, ...], unit: str | None) -> Times:
+    if source[0].suffix == ".npz":
+        arrays = load_arrays(source[0])
+        names = ("timestamps_start", "timestamps_end")
+        if not set(names) <= arrays.keys():
+            names = ("timestamps", "timestamps")
+        if not set(names) <= arrays.keys():
+            raise CaptureError(
+                "no times of pictures found", where=source[0], got=", ".join(arrays) or "no arrays"
+            )
+        columns, told = [arrays[name].reshape(-1) for name in names], None
+    elif len(source) == 2:
+        (starts, told), (ends, _) = (_table(path) for path in source)
+        columns = [starts[:, 0], ends[:, 0]]
+    else:
+        table, told = _table(source[0])
+        columns = [table[:, 0], table[:, min(1, table.shape[1] - 1)]]
+    if len(columns[0]) != len(columns[1]):
+        raise CaptureError(
+            "there must be an end for each start of an exposure",
+            where=" and ".join(map(str, source)),
+            got=f"{len(columns[0])} and {len(columns[1])}",
+        )
+    unit = unit or told
+    if unit is None:
+        raise _no_unit(source[0], columns[0])
+    opens, closes = (whole_us(column, known_unit(unit), source[0]) for column in columns)
+    return opens, closes
+
+
+def _table(path: Path) -> tuple[Shaped[np.ndarray, "n k"], str | None]:
+    """Numbers of a text, and the unit that its header names."""
+    rows, told = [], None
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines()):
+        words = line.replace(",", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([int(word) if word.isdecimal() else float(word) for word in words])
+        except ValueError:
+            if rows:
+                raise CaptureError(
+                    "cannot read a time", where=f"{path}, line {number + 1}", got=line[:60]
+                ) from None
+            units = {unit for match in TOLD.findall(line) for unit in match if unit}
+            told = units.pop() if len(units) == 1 else told
+    if not rows or len({len(row) for row in rows}) != 1:
+        raise CaptureError(
+            "a file of times needs the same number of columns in each line",
+            where=path,
+            got=f"{len(rows)} lines of {sorted({len(row) for row in rows})} columns",
+        )
+    return np.array(rows), told
+
+
+def _rpg(listed: Path) -> tuple[list[Path], Times]:
+    """Pictures and times of `images.txt`."""
+    files, seconds = [], []
+    for number, line in enumerate(listed.read_text(encoding="utf-8").splitlines()):
+        words = line.split(maxsplit=1)
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            seconds.append(float(words[0]))
+            file = listed.parent / words[1].strip()
+        except (ValueError, IndexError):
+            raise CaptureError(
+                "a line must be a time and the path of a picture",
+                where=f"{listed}, line {number + 1}",
+                got=line[:60],
+            ) from None
+        if not file.resolve().is_relative_to(listed.parent.resolve()):
+            raise CaptureError("a picture lies outside the recording", where=listed, got=file)
+        files.append(file)
+    if not files:
+        raise CaptureError("no pictures are listed", where=listed)
+    times_us = whole_us(np.array(seconds), "s", listed)
+    return files, (times_us, times_us)
+
+
+def _no_unit(path: Path, column: Shaped[np.ndarray, "n"]) -> CaptureError:
+    span = float(column[-1]) - float(column[0])
+    lasts = ", ".join(f"{span * UNITS[unit] / 1e6:.4g} s if {unit}" for unit in UNITS)
+    return CaptureError(
+        "nothing says in which unit the times of pictures are",
+        where=path,
+        got=f"{column[0]} to {column[-1]}, which is {lasts}",
+        do="give the unit: ns, us, ms or s",
+    )
+
+
+def _rate(per_second: float) -> float:
+    if not 0 < per_second <= FASTEST:
+        raise OptionError("pictures per second must be between 0 and a million", got=per_second)
+    return per_second
