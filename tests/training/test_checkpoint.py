@@ -58,6 +58,21 @@ def test_what_is_saved_comes_back(tmp_path: Path, trained):
             assert value.stride() == copied.state[b][moment].stride()
 
 
+def test_a_part_under_two_names_is_saved_once(tmp_path: Path):
+    model = Toy(20)
+    model.again = model.net
+    save_last(tmp_path, model, adam(model), Progress(0, 20, settings=SETTINGS))
+    saved = load(file_of(tmp_path, "last"))
+    assert not any("again" in name for name in saved.tensors)
+
+    other = Toy(20)
+    other.again = other.net
+    with torch.no_grad():
+        other.net[0].weight.zero_()
+    restore(saved, other, adam(other))
+    assert other.again[0].weight.equal(model.net[0].weight)
+
+
 def test_training_goes_on_as_if_never_saved(tmp_path: Path, trained):
     save(tmp_path, trained, 12)
     model = Toy(20)

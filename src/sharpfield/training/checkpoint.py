@@ -178,7 +178,7 @@ def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
     }
     module = module_of(model)
     _make_room(saved, module)
-    state = module.state_dict()
+    state = _state(module)
     wrong = sorted(saved.keys() ^ state.keys()) + [
         f"{name} {list(saved[name].shape)} for {list(tensor.shape)}"
         for name, tensor in state.items()
@@ -190,7 +190,7 @@ def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
             got=", ".join(wrong[:4]) + (f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""),
             do="use the recipe, the settings and the capture that the run was started with",
         )
-    module.load_state_dict(saved)
+    module.load_state_dict(saved, strict=False)  # what has two names was saved under one
 
 
 def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -236,8 +236,14 @@ def _write(path: Path, tensors: dict[str, Tensor], progress: Progress) -> None:
 
 
 def _model_tensors(model: Model) -> dict[str, Tensor]:
-    state = module_of(model).state_dict()
+    state = _state(module_of(model))
     return {f"model.{name}": tensor.detach().cpu().contiguous() for name, tensor in state.items()}
+
+
+def _state(module: nn.Module) -> dict[str, Tensor]:
+    """What a module would save, each tensor under the first of its names."""
+    first = {name for name, _ in [*module.named_parameters(), *module.named_buffers()]}
+    return {name: tensor for name, tensor in module.state_dict().items() if name in first}
 
 
 def _optimizer_tensors(model: Model, optimizer: Optimizer) -> dict[str, Tensor]:
