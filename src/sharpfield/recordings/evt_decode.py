@@ -1,0 +1,260 @@
+"""Prophesee's event encodings, decoded word by word with what earlier words left behind.
+
+    EVT2    32-bit words: one event, or the high part of the time, or a trigger edge
+    EVT2.1  64-bit words: up to 32 neighbours of one row, or as above
+    EVT3    16-bit words: each changes one thing (row, low or high time) or reports events
+
+Vocabulary: the *counter* is the high part of the time as a word holds it, which wraps; `HIGH` is
+the same unwrapped. Times are in us: the counter counts 64 us (EVT2, EVT2.1) or 4096 us (EVT3).
+
+A decoder is a loop over words that keeps all it knows in an array of numbers, so that a file may
+be cut into blocks anywhere. It stops early when there is no room for what it finds, or when it
+has to see the words after a block to judge one in it (see `_far`).
+
+Source: Prophesee, *EVT 2.0*, *EVT 2.1* and *EVT 3.0 format* (Metavision documentation). A new
+counter in EVT3 sets the low part to zero until its own word comes, a repeated one does not.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+HIGH, STARTED, LOW, ROW, BASE, SIGN, UNTIMED, UNCONFIRMED, UNKNOWN = range(9)
+"""What a decoder remembers: the unwrapped counter and whether there was one; of EVT3 the low time,
+row (or `NO_ROW`), column and polarity of the next vector; and counts of what was left out."""
+
+REMEMBERED = 9
+"""How many numbers that is."""
+
+NO_ROW, OTHER_ROW = -1, -2
+"""No row yet, and a row of exposure measurements, which are no events."""
+
+ROOM = 32
+"""Most events that one word can hold."""
+
+NEAR_US = 2**18
+"""The counter normally goes on by less than this: cameras write it every few us."""
+
+LOOK = 2**16
+"""How many words ahead a counter is confirmed."""
+
+DE_BRUIJN = 0x077CB531
+LOWEST = np.zeros(32, np.int64)
+"""Number of the lowest set bit of a 32-bit word w, at `(w & -w) * DE_BRUIJN >> 27`."""
+LOWEST[[(DE_BRUIJN << k & 0xFFFFFFFF) >> 27 for k in range(32)]] = np.arange(32)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def decode_evt2(words, state, last, columns, end, edges):
+    """EVT2, from 32-bit words.
+
+    Args:
+        words: The next words.
+        state: `REMEMBERED` numbers, zero at first but for `ROW` = `NO_ROW`; updated.
+        last: Whether no words follow these.
+        columns: x, y, t and p, written from `end` on.
+        end: How many events there are already.
+        edges: Rows of time, edge and channel, written from the first on.
+
+    Returns:
+        How many words were used up, events there are now, and edges were found.
+    """
+    x, y, t, p = columns
+    found = 0
+    for i in range(words.size):
+        if end + ROOM > t.size or found == len(edges):
+            return i, end, found
+        word = np.int64(words[i])
+        kind = word >> 28
+        if kind <= 1:
+            if state[STARTED]:
+                x[end] = (word >> 11) & 0x7FF
+                y[end] = word & 0x7FF
+                t[end] = state[HIGH] << 6 | ((word >> 22) & 0x3F)
+                p[end] = 2 * kind - 1
+                end += 1
+            else:
+                state[UNTIMED] += 1
+        elif kind == 0x8:
+            if not _advance(words, i, state, last, 28, 0):
+                return i, end, found
+        elif kind == 0xA:
+            if state[STARTED]:
+                _edge(edges, found, state[HIGH] << 6 | ((word >> 22) & 0x3F), word, 0x1F)
+                found += 1
+        elif kind <= 0x7 or kind == 0x9:
+            state[UNKNOWN] += 1
+    return words.size, end, found
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def decode_evt21(words, state, last, columns, end, edges):
+    """EVT2.1, from 64-bit words with the type on top; see `decode_evt2`."""
+    x, y, t, p = columns
+    found = 0
+    for i in range(words.size):
+        if end + ROOM > t.size or found == len(edges):
+            return i, end, found
+        word = np.int64(words[i] >> np.uint64(32))
+        kind = word >> 28
+        if kind <= 1:
+            bits = np.int64(words[i] & np.uint64(0xFFFFFFFF))
+            if state[STARTED]:
+                time = state[HIGH] << 6 | ((word >> 22) & 0x3F)
+                column, row, sign = (word >> 11) & 0x7FF, word & 0x7FF, 2 * kind - 1
+                end = _vector(columns, end, bits, column, row, time, sign)
+            else:
+                state[UNTIMED] += _ones(bits)
+        elif kind == 0x8:
+            if not _advance(words, i, state, last, 60, 32):
+                return i, end, found
+        elif kind == 0xA:
+            if state[STARTED]:
+                _edge(edges, found, state[HIGH] << 6 | ((word >> 22) & 0x3F), word, 0x1F)
+                found += 1
+        elif kind <= 0x7 or kind == 0x9 or (kind >= 0xB and kind <= 0xD):
+            state[UNKNOWN] += 1
+    return words.size, end, found
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def decode_evt3(words, state, last, columns, end, edges):
+    """EVT3, from 16-bit words; see `decode_evt2`."""
+    x, y, t, p = columns
+    found = 0
+    used = words.size
+    row, time = state[ROW], state[HIGH] << 12 | state[LOW]
+    live = state[STARTED] and row >= 0
+    for i in range(words.size):
+        if end + ROOM > t.size or found == len(edges):
+            used = i
+            break
+        word = np.int64(words[i])
+        kind = word >> 12
+        if kind == 0x2:
+            if live:
+                x[end], y[end], t[end] = word & 0x7FF, row, time
+                p[end] = ((word >> 10) & 2) - 1
+                end += 1
+            elif row != OTHER_ROW:
+                state[UNTIMED] += 1
+        elif kind <= 0x1:
+            row = word & 0x7FF if kind == 0 else OTHER_ROW
+            live = state[STARTED] and row >= 0
+        elif kind == 0x6:
+            state[LOW] = word & 0xFFF
+            time = state[HIGH] << 12 | state[LOW]
+        elif kind == 0x3:
+            state[BASE], state[SIGN] = word & 0x7FF, ((word >> 10) & 2) - 1
+        elif kind <= 0x5:
+            bits = word & (0xFFF if kind == 0x4 else 0xFF)
+            if live:
+                end = _vector(columns, end, bits, state[BASE], row, time, state[SIGN])
+            elif row != OTHER_ROW:
+                state[UNTIMED] += _ones(bits)
+            state[BASE] = min(state[BASE] + (12 if kind == 0x4 else 8), 0x7FFF)
+        elif kind == 0x8:
+            before = state[HIGH]
+            if not _advance(words, i, state, last, 12, 0):
+                used = i
+                break
+            state[LOW] = state[LOW] if state[HIGH] == before else 0
+            time = state[HIGH] << 12 | state[LOW]
+            live = row >= 0
+        elif kind == 0xA:
+            if state[STARTED]:
+                _edge(edges, found, time, word, 0xF)
+                found += 1
+        elif kind == 0x9 or kind == 0xB or kind == 0xC:
+            state[UNKNOWN] += 1
+    state[ROW] = row
+    return used, end, found
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _edge(edges, found, time, word, channels):
+    edges[found, 0], edges[found, 1] = time, 2 * (word & 1) - 1
+    edges[found, 2] = (word >> 8) & channels
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _vector(columns, end, bits, column, row, time, sign):
+    """Write an event for each set bit of a 32-bit mask, the lowest at `column`."""
+    x, y, t, p = columns
+    while bits:
+        lowest = bits & -bits
+        x[end] = column + LOWEST[(lowest * DE_BRUIJN & 0xFFFFFFFF) >> 27]
+        y[end], t[end], p[end] = row, time, sign
+        end += 1
+        bits ^= lowest
+    return end
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _ones(bits):
+    count = 0
+    while bits:
+        bits &= bits - 1
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _advance(words, i, state, last, kind_at, counter_at):
+    """Take over the counter of word i. False if words after these are needed to judge it."""
+    mask = 0xFFF if kind_at == 12 else 0xFFFFFFF
+    near = NEAR_US >> (12 if kind_at == 12 else 6)
+    counter = (np.int64(words[i]) >> counter_at) & mask
+    if not state[STARTED]:
+        state[HIGH], state[STARTED] = counter, 1
+        return True
+    step = _step(state[HIGH] & mask, counter, mask, near)
+    if abs(step) > near:
+        following = _following(words, i, last, kind_at, counter_at, mask)
+        if following == -2:
+            return False
+        if following >= 0 and _far(state[HIGH] & mask, counter, following, mask, near):
+            state[UNCONFIRMED] += 1
+            return True
+    state[HIGH] += step
+    return True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _step(before, counter, mask, near):
+    """How far a counter went on, or back (negative), wraps undone."""
+    ahead = (counter - before) & mask
+    back = mask + 1 - ahead
+    if ahead <= back or (back > near and counter > before):
+        return ahead
+    return -back
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _far(before, counter, following, mask, near):
+    """Whether a counter is a lone outlier: the next one goes on from the one before.
+
+    One wrong bit would otherwise make time jump and, once it jumps back, pass for a wrap.
+    """
+    goes_on = abs(_step(before, following, mask, near)) <= near
+    return goes_on and abs(_step(counter, following, mask, near)) > near
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _following(words, i, last, kind_at, counter_at, mask):
+    """The next counter within `LOOK` words; -1 if there is none, -2 if these words are too few."""
+    for j in range(i + 1, min(i + LOOK, words.size)):
+        if (np.uint64(words[j]) >> np.uint64(kind_at)) == 8:
+            return (np.int64(words[j]) >> counter_at) & mask
+    return -1 if last or i + LOOK <= words.size else -2
