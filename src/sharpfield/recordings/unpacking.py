@@ -1,13 +1,16 @@
 """Compressed blocks of a file, unpacked without trusting what they say of themselves."""
 
 import bz2
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from sharpfield.core.extras import need
 
 LIMIT = 2**28
 """No sound block is larger once unpacked (16 million events)."""
+
+PORTION = 2**22
+"""Bytes unpacked at once: asking for more makes room for more."""
 
 
 class Damaged(ValueError):
@@ -47,22 +50,37 @@ def _zstd(data: bytes) -> bytes:
     zstd: Any = need("zstandard", extra="io", purpose="reading a recording packed with Zstandard")
     try:
         with zstd.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as reader:
-            found = reader.read(LIMIT + 1)
+            found = _collected(iter(lambda: reader.read(PORTION), b""))
     except zstd.ZstdError as error:
         raise Damaged(str(error)) from None
-    if not found or len(found) > LIMIT:
-        raise Damaged(f"{len(found)} bytes unpacked")
+    if not found:
+        raise Damaged("a torn block")
     return found
 
 
 def _limited(decompressor: Any, data: bytes, failure: type[Exception]) -> bytes:
+    def portions() -> Iterator[bytes]:
+        yield decompressor.decompress(data, max_length=PORTION)
+        while not decompressor.eof:
+            if decompressor.needs_input:
+                raise Damaged("a torn block")
+            yield decompressor.decompress(b"", max_length=PORTION)
+
     try:
-        found = decompressor.decompress(data, max_length=LIMIT)
+        return _collected(portions())
     except (failure, EOFError) as error:
         raise Damaged(str(error)) from None
-    if not decompressor.eof:
-        raise Damaged("a torn block")
-    return found
+
+
+def _collected(portions: Iterator[bytes]) -> bytes:
+    found: list[bytes] = []
+    size = 0
+    for portion in portions:
+        size += len(portion)
+        if size > LIMIT:
+            raise Damaged("a block that grows without end")
+        found.append(portion)
+    return found[0] if len(found) == 1 else b"".join(found)
 
 
 _UNPACK: dict[str, Callable[[bytes], bytes]] = {
