@@ -21,10 +21,12 @@ from sharpfield.simulation import (
     MOVING_RIG,
     MOVING_SCENES,
     MOVING_TIMING,
+    ROOM_RIG,
     SCENES,
     SENSORS,
     FrameSensor,
     Rig,
+    RoomTiming,
     Timing,
     Views,
     folder_footage,
@@ -32,11 +34,40 @@ from sharpfield.simulation import (
     ring,
     simulate_footage,
     simulate_moving,
+    simulate_room,
     video_footage,
 )
 from sharpfield.simulation import simulate as simulate_scene
 
 Size = Annotated[str, tyro.conf.arg(metavar="WxH")]
+
+
+@dataclass(frozen=True)
+class Walked:
+    """A walk through the room, whose frames come with measured depth."""
+
+    blurry: float = 0.75
+    """Share of the room's training frames that is blurred."""
+    blur: Literal["motion", "published"] = "motion"
+    """By the walk, or each picture by a random kernel, as published."""
+    events: bool = False
+    """Whether an event camera walks along; other scenes always have one."""
+
+    def timing(self, timed: "Timed", layout: str) -> RoomTiming:
+        """When frames are taken; a layout that fixes what is held out has its own split."""
+        given = {k: v for k, v in vars(timed).items() if v is not None}
+        if "most_change" in given:
+            raise OptionError("a walk has even steps", got="most_change", do="give step_us")
+        return RoomTiming(
+            blurry=self.blurry,
+            blur=self.blur,
+            events=self.events,
+            train_every=SCANNET_EVERY if layout == "scannet" else 0,
+            **given,
+        )
+
+
+WALKED = Walked()
 
 
 @dataclass(frozen=True)
@@ -51,6 +82,7 @@ class Recording:
     """Contrast threshold of both signs, instead of the sensor's own."""
     colour: bool = False
     """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
+    walk: Walked = WALKED
 
     def sensors(self, base: Rig, size: tuple[int, int]) -> Rig:
         """The two sensors behind the lens of a rig."""
@@ -83,16 +115,16 @@ class Around:
 
 @dataclass(frozen=True)
 class Timed:
-    """When the shutter opens, and how finely light is sampled; in brackets for moving scenes."""
+    """When the shutter opens, and how finely light is sampled; in brackets: moving scenes, room."""
 
     frames: int | None = None
-    """Of each camera: 18 (33)."""
+    """Of each camera: 18 (33, 200)."""
     exposure_us: int | None = None
-    """50000 (0: sharp frames)."""
+    """50000 (0: sharp frames, as long as the share of blurry frames needs)."""
     interval_us: int | None = None
-    """From one exposure's start to the next: 56000 (31250)."""
+    """From one exposure's start to the next: 56000 (31250, 100000)."""
     step_us: int | None = None
-    """Between two pictures of the scene: 1000 (1250)."""
+    """Between two pictures of the scene: 1000 (1250, 4000 for events only)."""
     most_change: float | None = None
     """Largest change of log intensity between two pictures, which are placed closer where it is
     exceeded; 0 for even steps."""
@@ -105,14 +137,17 @@ class Timed:
 
 
 RECORDING, AROUND, TIMED, DEBLURRING = Recording(), Around(), Timed(), DeblurOptions()
-STILL_SIZE, MOVING_SIZE = "240x160", "64x64"
+STILL_SIZE, MOVING_SIZE, ROOM_SIZE = "240x160", "64x64", "240x180"
+ROOM = "room"
+SCANNET_EVERY = 5
+"""Published work learns from one frame in so many of a ScanNet scene."""
 
 
 def simulate(
     out: Path,
     scene: str = "garden",
     size: Size | None = None,
-    layout: Literal["native", "ev-deblur-nerf", "evdnerf"] = "native",
+    layout: Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"] = "native",
     seed: int = 0,
     recording: Recording = RECORDING,
     around: Around = AROUND,
@@ -122,18 +157,22 @@ def simulate(
 
     Args:
         out: Folder of the capture.
-        scene: A scene by name: garden, shelf, tiles, mobile; or spinner, arm, jelly, which move
-            and are seen from all around.
-        size: Of the sensor, in pixels; by default 240x160, or 64x64 for a moving scene.
+        scene: A scene by name: garden, shelf, tiles, mobile; spinner, arm, jelly, which move
+            and are seen from all around; or room, which is walked through with a depth camera.
+        size: Of the sensor, in pixels; by default 240x160, 64x64 for a moving scene, or 240x180
+            for the room.
         layout: Files to write.
         seed: Of the camera path and of all noise.
         recording: Path and sensors.
         around: Cameras of a moving scene.
         timing: Frames, exposures and sampling.
     """
-    _known("scene", scene, [*SCENES, *MOVING_SCENES])
+    _known("scene", scene, [*SCENES, *MOVING_SCENES, ROOM])
     _known("motion", recording.motion, MOTIONS)
-    if scene in MOVING_SCENES:
+    if scene == ROOM:
+        rig = recording.sensors(ROOM_RIG, parse_size(size or ROOM_SIZE))
+        made = simulate_room(rig=rig, timing=recording.walk.timing(timing, layout), seed=seed)
+    elif scene in MOVING_SCENES:
         rig = recording.sensors(MOVING_RIG, parse_size(size or MOVING_SIZE))
         views, timed = around.cameras(recording, seed), timing.over(MOVING_TIMING)
         made = simulate_moving(scene, views, rig=rig, timing=timed, seed=seed)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from sharpfield.simulation.surfaces import BALL, BOX, RECTANGLE, Surfaces
+from sharpfield.simulation.surfaces import BALL, BOX, CYLINDER, RECTANGLE, Surfaces
 from sharpfield.simulation.textures import SOLID, TEXT, page
 
 Real = float | int
@@ -38,7 +38,7 @@ class Paint:
 
 @dataclass(frozen=True)
 class Surface:
-    """A rectangle, ball or box."""
+    """A rectangle, ball, box or cylinder."""
 
     kind: int
     centre: Vector
@@ -87,6 +87,19 @@ def box(
     """A box of `size` (width, height, depth)."""
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
     return Surface(BOX, centre, half, paint, turn, sway=sway)
+
+
+def cylinder(
+    centre: Vector,
+    radius: Real,
+    height: Real,
+    paint: Paint,
+    *,
+    turn: Vector = (0.0, 0.0, 0.0),
+    throws_shadow: bool = True,
+) -> Surface:
+    """An upright cylinder, closed at both ends."""
+    return Surface(CYLINDER, centre, (radius, height / 2, radius), paint, turn, throws_shadow)
 
 
 def build(

@@ -1,4 +1,4 @@
-"""Light along rays, from rectangles, balls and boxes with closed-form textures.
+"""Light along rays, from rectangles, balls, boxes and cylinders with closed-form textures.
 
 Silhouettes are as soft as a pixel is wide: a surface *covers* a share of a ray, and what it leaves
 open goes on to the next surface. Light therefore changes continuously as the camera moves, as
@@ -17,7 +17,7 @@ from numba import njit
 
 from sharpfield.simulation.textures import TEXT, letters, paint
 
-RECTANGLE, BALL, BOX = range(3)
+RECTANGLE, BALL, BOX, CYLINDER = range(4)
 """The surfaces."""
 
 DARKEST = 0.02
@@ -36,9 +36,10 @@ class Surfaces(NamedTuple):
     """All surfaces of a scene, as tables of plain numbers, which compiled code passes cheaply."""
 
     shape: Float64[np.ndarray, "n 18"]
-    """Kind; centre (3); half extents (3; the first is a ball's radius); the linear map from the
-    world to the surface's own axes (9; rows are its x, y and z axes unless it is deformed; a
-    rectangle faces -z); 1 if it throws a shadow; the radius of a ball around it."""
+    """Kind; centre (3); half extents (3; the first is the radius of a ball or cylinder); the linear
+    map from the world to the surface's own axes (9; rows are its x, y and z axes unless it is
+    deformed; a rectangle faces -z, a cylinder is long in y); 1 if it throws a shadow; the radius of
+    a ball around it."""
     look: Float64[np.ndarray, "n 16"]
     """Linear RGB of ground, ink and accent (9); texture, cells per unit, seed, slant; page of text
     and its rows and columns."""
@@ -210,6 +211,8 @@ def _meet(shape, i, ray, footprint):
         a = (half[0] - abs(x + t * dx)) / width + 0.5
         b = (half[1] - abs(y + t * dy)) / width + 0.5
         return t, min(max(a, 0.0), 1.0) * min(max(b, 0.0), 1.0)
+    if shape[i, 0] == CYLINDER:
+        return _meet_cylinder(half, x, y, z, dx, dy, dz, footprint)
     enter, leave = _slabs(half, x, y, z, dx, dy, dz)
     if leave <= max(enter, 0.0) or enter <= 0.0:
         return NOTHING, 0.0
@@ -227,6 +230,33 @@ def _slabs(half, x, y, z, dx, dy, dz):
         a, b = (-h - p) / d, (h - p) / d
         enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     return enter, leave
+
+
+@njit(cache=True, fastmath=True)
+@no_type_check
+def _meet_cylinder(half, x, y, z, dx, dy, dz, footprint):
+    """Distance along a ray in a cylinder's axes, and the share of the ray that it covers."""
+    radius, height = half[0], half[1]
+    flat = max(dx * dx + dz * dz, 1e-12)
+    along = -(x * dx + z * dz) / flat  # where the ray is nearest to the axis
+    px, pz = x + along * dx, z + along * dz
+    aside = sqrt(px * px + pz * pz)
+    width = footprint * max(along, 0.0) if flat > 1e-9 else 0.0
+    wide = radius + 0.5 * width
+    if aside >= wide:
+        return NOTHING, 0.0
+    steep = dy if abs(dy) > 1e-9 else 1e-9
+    a, b = (-height - y) / steep, (height - y) / steep
+    above, below = min(a, b), max(a, b)
+    reach = sqrt(max(radius * radius - aside * aside, 0.0) / flat)
+    enter = max(along - reach, above)
+    # Half a pixel wider, so that the chord at the silhouette is long: there `aside` says how much.
+    wider = sqrt((wide * wide - aside * aside) / flat)
+    chord = min(along + wider, below) - max(along - wider, above)
+    if chord <= 0.0 or enter <= 0.0:
+        return NOTHING, 0.0
+    side = (radius - aside) / width + 0.5 if width > 0.0 else 1.0
+    return enter, min(min(max(side, 0.0), 1.0), min(chord / (2.0 * footprint * enter), 1.0))
 
 
 @njit(cache=True, fastmath=True)
@@ -274,6 +304,13 @@ def _surface_point(shape, i, ray, t):
         radius = shape[i, 4]
         nx, ny, nz = x / radius, y / radius, z / radius
         u, v = radius * atan2(nx, -nz), radius * asin(min(max(ny, -1.0), 1.0))
+    elif shape[i, 0] == CYLINDER:
+        radius = sqrt(x * x + z * z)
+        if shape[i, 5] - abs(y) <= shape[i, 4] - radius:
+            ny, nz, v = (-1.0 if y < 0 else 1.0), 0.0, z
+        else:
+            nx, nz = x / max(radius, 1e-9), z / max(radius, 1e-9)
+            u = shape[i, 4] * atan2(nx, -nz)
     elif shape[i, 0] == BOX:
         a, b, c = shape[i, 4] - abs(x), shape[i, 5] - abs(y), shape[i, 6] - abs(z)
         if c <= a and c <= b:

@@ -1,0 +1,309 @@
+"""One call from the room to a capture with depth: a walk whose frames are blurred as walks blur.
+
+Frames are taken evenly; the shutter is open for the same time in each, as long as it takes for a
+wanted share of them to be blurred. Which ones are sharp is up to the walk: those of its pauses. All
+else is known: the sharp picture and the depth in the middle of each exposure, the pose at any time,
+and the true blur of every frame (`notes["blur_px"]`, see `simulation.travel`). Held-out frames are
+instants, and therefore sharp.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from os import cpu_count
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.depth import MILLIMETRE, DepthMaps
+from sharpfield.core.errors import OptionError
+from sharpfield.core.events import EventStream
+from sharpfield.core.exposure import Exposure
+from sharpfield.core.frames import Frames
+from sharpfield.core.seed import numpy_generator
+from sharpfield.simulation.blur import Exposing, store
+from sharpfield.simulation.events import EventPixels, Gap, joined
+from sharpfield.simulation.motion import CameraPath, stamped
+from sharpfield.simulation.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
+from sharpfield.simulation.room import room
+from sharpfield.simulation.scenes import Scene
+from sharpfield.simulation.simulate import AHEAD, MARGIN_US, Rig, view
+from sharpfield.simulation.travel import exposure_for, instants, travel
+from sharpfield.simulation.walk import walk
+
+BLURRY_OF_WIDTH = 0.006
+"""A frame counts as blurry when its points travel this share of the image's width: 1.4 px of 240,
+3.8 px of 640."""
+STRIDE_PX = 0.8
+"""How far points may travel between two of the pictures that make up a blurred frame."""
+MOST_PICTURES = 64
+PROBE_PX = 24
+"""Width of the pictures in which travel is measured."""
+OPEN_OF_INTERVAL = 0.9
+"""Longest exposure over the interval between two."""
+FARTHEST_M = 65.0
+"""Depth that 16 bits of millimetres can hold."""
+
+BLUR_NOTE = "blur_px"
+"""Note of a capture: true blur of each frame."""
+
+Blur = Literal["motion", "published"]
+
+
+@dataclass(frozen=True)
+class RoomTiming:
+    """How many frames, how blurred, and which are held out."""
+
+    frames: int = 200
+    interval_us: int = 100_000
+    """From one exposure's start to the next."""
+    blurry: float = 0.75
+    """Share of the frames learned from that is blurred."""
+    blur: Blur = "motion"
+    """By the walk while the shutter is open; or as published, each picture by one random kernel."""
+    exposure_us: int | None = None
+    """By default as long as it takes for that share."""
+    test_every: int = 8
+    """Every how many frames one is sharp and held out, the first included; 0 for none."""
+    train_every: int = 0
+    """Instead: learn from one frame in so many, and hold all others out, as published (5)."""
+    events: bool = False
+    """Whether an event camera watches, too; takes several times longer."""
+    step_us: int = 4000
+    """Between two of the pictures it watches."""
+
+    def __post_init__(self) -> None:
+        if self.frames < 2 or self.interval_us < 1000 or self.step_us < 1:
+            raise OptionError(
+                "a walk needs two frames, and an interval of 1000 us",
+                got=f"{self.frames} frames, {self.interval_us} us, step {self.step_us} us",
+            )
+        if not 0 <= self.blurry <= 1:
+            raise OptionError("the share of blurry frames lies between 0 and 1", got=self.blurry)
+        if self.exposure_us is not None and not 0 <= self.exposure_us <= self.interval_us:
+            raise OptionError(
+                "exposures would overlap",
+                got=f"one of {self.exposure_us} us every {self.interval_us} us",
+            )
+
+    @property
+    def held_out(self) -> Bool[np.ndarray, "n"]:
+        """Which frames are sharp and held out."""
+        index = np.arange(self.frames)
+        if self.train_every:
+            return index % self.train_every != 0
+        return (index % self.test_every == 0) if self.test_every else index < 0
+
+    def middle_us(self) -> Int64[np.ndarray, "n"]:
+        """Middles of the exposures."""
+        return MARGIN_US + self.interval_us // 2 + np.arange(self.frames) * self.interval_us
+
+    def span_us(self) -> int:
+        """Length of the recording."""
+        return self.frames * self.interval_us + 2 * MARGIN_US
+
+
+ROOM_RIG, ROOM_TIMING = Rig(size=(240, 180)), RoomTiming()
+
+
+def simulate_room(
+    *,
+    rig: Rig = ROOM_RIG,
+    timing: RoomTiming = ROOM_TIMING,
+    kernels: KernelRange = PUBLISHED,
+    seed: int = 0,
+) -> Capture:
+    """Record a walk through the room with a depth camera and a global shutter.
+
+    Args:
+        rig: Sensors and their numbers.
+        timing: Frames, their blur, and which are held out.
+        kernels: What published blur is drawn from; its probability is `timing.blurry`.
+        seed: Of the walk, the kernels and the noise.
+
+    Returns:
+        A capture with measured depth, truth of every frame, and in `notes` its true blur.
+    """
+    place, camera, clock = room(), rig.camera(), Clock(0, timing.span_us())
+    path = walk(timing.span_us(), seed)
+    probe = _Probe(place, camera, path, timing.middle_us())
+    exposure = _exposure(probe, camera, timing)
+    recorded = _Recorded(exposure, rig, seed, events=timing.events)
+    for t_us, rgb, depth in _pictures(place, camera, path, _times(probe, exposure, timing)):
+        recorded.see(t_us, rgb, depth)
+    frames, events = recorded.frames(), recorded.events()
+    blur = np.array([probe.travel(i, exposure.window(i)).mean() for i in range(len(exposure))])
+    if timing.blur == "published":
+        ranges = replace(kernels, probability=timing.blurry)
+        frames, blur = _as_published(frames, timing.held_out, ranges, seed)
+    depth = np.stack(recorded.depth)
+    stored = np.where(depth < FARTHEST_M, depth / MILLIMETRE, 0)
+    return Capture(
+        camera=camera,
+        trajectory=stamped(path, clock),
+        clock=clock,
+        near=place.near,
+        far=place.far,
+        frames=frames,
+        events=events,
+        split=Split(np.flatnonzero(~timing.held_out), np.flatnonzero(timing.held_out)),
+        depth=DepthMaps(np.rint(stored).astype(np.uint16), camera),
+        name=place.name,
+        source="simulation",
+        notes={BLUR_NOTE: blur, **recorded.notes()},
+    )
+
+
+class _Probe:
+    """How points travel during each frame, from small pictures."""
+
+    def __init__(
+        self, place: Scene, camera: Camera, path: CameraPath, middle_us: Int64[np.ndarray, "n"]
+    ) -> None:
+        self._path = path
+        self._small = camera.scaled(min(PROBE_PX / camera.width, 1.0))
+        self._larger = camera.width / self._small.width
+        self._depth = [view(place, self._small, pose)[1] for pose in path.poses(middle_us)]
+
+    def travel(self, frame: int, window_us: tuple[int, int]) -> Float64[np.ndarray, "q"]:
+        """In px of the full camera."""
+        return self._larger * travel(self._small, self._path, self._depth[frame], window_us)
+
+
+def _exposure(probe: _Probe, camera: Camera, timing: RoomTiming) -> Exposure:
+    """All exposures; those of held-out frames, and of all if blur is as published, are instants."""
+    middle = timing.middle_us()
+    learned = np.flatnonzero(~timing.held_out)
+
+    def travels(exposure_us: int) -> Float64[np.ndarray, "n"]:
+        opens = middle - exposure_us // 2
+        windows = [(int(opens[i]), int(opens[i]) + exposure_us) for i in learned]
+        return np.array(
+            [probe.travel(i, window).mean() for i, window in zip(learned, windows, strict=True)]
+        )
+
+    if timing.blur == "published":
+        return Exposure(middle, middle)
+    exposure_us = timing.exposure_us
+    if exposure_us is None:
+        exposure_us = exposure_for(
+            travels,
+            blurry=timing.blurry,
+            blur_px=BLURRY_OF_WIDTH * camera.width,
+            most_us=int(OPEN_OF_INTERVAL * timing.interval_us),
+        )
+    opens = np.where(timing.held_out, middle, middle - exposure_us // 2)
+    return Exposure(opens, np.where(timing.held_out, middle, opens + exposure_us))
+
+
+def _times(probe: _Probe, exposure: Exposure, timing: RoomTiming) -> Int64[np.ndarray, "k"]:
+    """When to draw a picture: often enough during exposures, and evenly for events."""
+    times = []
+    for i in range(len(exposure)):
+        far = float(np.quantile(probe.travel(i, exposure.window(i)), 0.95))
+        pictures = min(int(np.ceil(far / STRIDE_PX)) + 1, MOST_PICTURES)
+        times.append(instants(exposure, i, pictures=pictures))
+    if timing.events:
+        times.append(np.arange(0, timing.span_us() + 1, timing.step_us))
+    return np.unique(np.concatenate(times))
+
+
+Picture = tuple[int, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]
+"""Time, linear light and depth."""
+
+
+def _pictures(
+    place: Scene, camera: Camera, path: CameraPath, times_us: Int64[np.ndarray, "k"]
+) -> Iterator[Picture]:
+    def draw(t_us: int) -> Picture:
+        return t_us, *view(place, camera, path.poses(np.array([t_us]))[0])
+
+    with ThreadPoolExecutor(cpu_count()) as pool:
+        for first in range(0, len(times_us), AHEAD):
+            yield from pool.map(draw, times_us[first : first + AHEAD].tolist())
+
+
+class _Recorded:
+    """Frames, finished one after the other so that only one is held in full precision; events."""
+
+    def __init__(self, exposure: Exposure, rig: Rig, seed: int, *, events: bool) -> None:
+        self._exposure, self._rig, self._seed = exposure, rig, seed
+        self._frame = 0
+        self._open: Exposing | None = None
+        self._images: list[np.ndarray] = []
+        self._truth: list[np.ndarray] = []
+        self.depth: list[Float32[np.ndarray, "h w"]] = []
+        """In the middle of each exposure."""
+        self._pixels = EventPixels(rig.event_sensor, seed) if events else None
+        self._gaps: list[Gap] = []
+
+    def see(
+        self, t_us: int, rgb: Float32[np.ndarray, "h w 3"], depth: Float32[np.ndarray, "h w"]
+    ) -> None:
+        """A picture, after all earlier ones."""
+        if self._pixels is not None:
+            self._gaps.append(self._pixels.see(rgb, 1000 * t_us))
+        i = self._frame
+        if i == len(self._exposure) or t_us < self._exposure.open_us[i]:
+            return
+        if self._open is None:
+            one = Exposure(self._exposure.open_us[i : i + 1], self._exposure.close_us[i : i + 1])
+            self._open = Exposing(one, self._rig.size)
+        self._open.see(rgb, t_us)
+        sensor = self._rig.frame_sensor
+        draw = numpy_generator(self._seed, i, "frame noise")
+        if t_us == self._exposure.middle_us[i]:
+            self._truth.append(store(rgb, sensor.noiseless(), draw))
+            self.depth.append(depth)
+        if t_us == self._exposure.close_us[i]:
+            self._images.append(store(self._open.means()[0], sensor, draw))
+            self._open, self._frame = None, i + 1
+
+    def frames(self) -> Frames:
+        """All frames, each with the sharp picture in the middle of its exposure as its truth."""
+        count = len(self._exposure)
+        return Frames(
+            images=np.stack(self._images),
+            exposure=self._exposure,
+            track=np.zeros(count, np.int64),
+            names=tuple(f"{i:04d}" for i in range(count)),
+            encoding=self._rig.frame_sensor.encoding,
+            truth=np.stack(self._truth),
+            truth_known=np.ones(count, bool),
+        )
+
+    def events(self) -> EventStream | None:
+        """All events, if there was an event camera."""
+        if self._pixels is None:
+            return None
+        return joined(self._gaps, self._rig.size, bayer=self._rig.event_sensor.bayer)
+
+    def notes(self) -> dict[str, Note]:
+        """What a capture should say about the event camera."""
+        if self._pixels is None:
+            return {}
+        sensor, (on, off) = self._rig.event_sensor, self._pixels.thresholds()
+        return {
+            "threshold_on": sensor.threshold_on,
+            "threshold_off": sensor.threshold_off,
+            "threshold_on_map": on,
+            "threshold_off_map": off,
+            "refractory_us": sensor.refractory_us,
+            "log_floor": sensor.floor,
+        }
+
+
+def _as_published(
+    frames: Frames, held_out: Bool[np.ndarray, "n"], ranges: KernelRange, seed: int
+) -> tuple[Frames, Float64[np.ndarray, "n"]]:
+    """Frames learned from blurred by a random kernel each, and how far each kernel reaches."""
+    images, blur = frames.images.copy(), np.zeros(len(frames))
+    for i in np.flatnonzero(~held_out):
+        drawn = drawn_blur(ranges, numpy_generator(seed, int(i), "kernel"))
+        if drawn is not None:
+            images[i] = blurred(frames.images[i], drawn.kernel)
+            blur[i] = drawn.length_px
+    return replace(frames, images=images), blur
