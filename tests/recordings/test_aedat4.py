@@ -244,12 +244,18 @@ def test_several_cameras_must_be_chosen_from(tmp_path: Path) -> None:
     assert str(refused.value) == (
         "CaptureError: the file has several streams of EVTS\n"
         f"  where  {path}\n"
-        "  got    0 (DAVIS_0), 1 (DAVIS_1)\n"
-        "  do     choose one: events_of=0"
+        "  got    0 EVTS of DAVIS_0, 1 EVTS of DAVIS_1\n"
+        "  do     choose a topic: 0, or the name of a camera"
     )
-    expect_equal_events(open_aedat4(path, events_of=1).load(), right)
-    with pytest.raises(CaptureError, match="no stream 2 of EVTS"):
-        open_aedat4(path, events_of=2)
+    expect_equal_events(open_aedat4(path, topic="1").load(), right)
+    expect_equal_events(open_aedat4(path, topic="DAVIS_0").load(), left)
+    with pytest.raises(CaptureError, match="no stream or camera 2"):
+        open_aedat4(path, topic="2")
+
+
+def test_a_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="recording not found"):
+        open_aedat4(tmp_path / "a.aedat4")
 
 
 def test_the_size_is_asked_for_where_the_file_does_not_say(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.blocks import head
 from sharpfield.recordings.flatbuffers import Table, root
 from sharpfield.recordings.pieces import Chunks, Piece, joined, known_size
 from sharpfield.recordings.recording import Frame, Recording, Triggers, Trouble
@@ -70,26 +71,20 @@ class Layout:
 
 
 def open_aedat4(
-    path: Path,
-    *,
-    size: tuple[int, int] | None = None,
-    events_of: int | None = None,
-    frames_of: int | None = None,
+    path: Path, *, size: tuple[int, int] | None = None, topic: str | None = None
 ) -> Recording:
     """Open a file of DV.
 
     Args:
         path: Of the file.
         size: Of the event sensor, where the file does not say.
-        events_of: Number of the stream of events, where there are several.
-        frames_of: Number of the stream of frames, where there are several.
+        topic: Which of several cameras, by its name in the file, or by the number of a stream.
 
     Raises:
-        CaptureError: It is no AEDAT4; it has several streams of a kind and none was chosen.
+        CaptureError: It is no AEDAT4; it has streams of several cameras and none was chosen.
     """
     layout = _layout(path)
-    events = _chosen(layout, "EVTS", events_of, "events_of")
-    frames = _chosen(layout, "FRME", frames_of, "frames_of")
+    events, frames = (_chosen(layout, kind, topic) for kind in ("EVTS", "FRME"))
     triggers = [stream.number for stream in layout.streams.values() if stream.kind == "TRIG"]
     if events is not None or size is not None:
         stated = layout.streams[events].size if events is not None else None
@@ -110,6 +105,7 @@ def open_aedat4(
 
 
 def _layout(path: Path) -> Layout:
+    head(path, 1)  # says so if there is no such file
     length = path.stat().st_size
     try:
         with path.open("rb") as file:
@@ -168,20 +164,31 @@ def _whole(text: str | None) -> int | None:
     return int(text) if text and text.isascii() and text.isdigit() and len(text) < 10 else None
 
 
-def _chosen(layout: Layout, kind: str, asked: int | None, option: str) -> int | None:
+def _chosen(layout: Layout, kind: str, topic: str | None) -> int | None:
     """The stream of a kind that is meant, or None if there is none."""
     found = [stream for stream in layout.streams.values() if stream.kind == kind]
-    listed = ", ".join(f"{stream.number} ({stream.source})" for stream in found) or "none"
-    if asked is not None and asked not in [stream.number for stream in found]:
-        raise CaptureError(f"no stream {asked} of {kind}", where=layout.path, got=listed)
-    if asked is None and len(found) > 1:
+    if topic is not None:
+        number = _whole(topic)
+        named = None if number is None else layout.streams.get(number)
+        camera = named.source if named else topic
+        if camera not in [stream.source for stream in layout.streams.values()]:
+            raise CaptureError(
+                f"no stream or camera {topic}", where=layout.path, got=_listed(layout)
+            )
+        found = [named] if named in found else [one for one in found if one.source == camera]
+    if len(found) > 1:
         raise CaptureError(
             f"the file has several streams of {kind}",
             where=layout.path,
-            got=listed,
-            do=f"choose one: {option}={found[0].number}",
+            got=_listed(layout),
+            do=f"choose a topic: {found[0].number}, or the name of a camera",
         )
-    return asked if asked is not None else (found[0].number if found else None)
+    return found[0].number if found else None
+
+
+def _listed(layout: Layout) -> str:
+    streams = layout.streams.values()
+    return ", ".join(f"{stream.number} {stream.kind} of {stream.source}" for stream in streams)
 
 
 def _events(layout: Layout, number: int, size: tuple[int, int]) -> Chunks:
@@ -258,8 +265,8 @@ def _packets(layout: Layout, numbers: Sequence[int], name: str) -> Iterator[Tabl
     with layout.path.open("rb") as file:
         place = file.seek(layout.begin)
         while place < layout.end:
-            head = file.read(8)
-            number, size = struct.unpack("<ii", head) if len(head) == 8 else (-1, -1)
+            start = file.read(8)
+            number, size = struct.unpack("<ii", start) if len(start) == 8 else (-1, -1)
             place += 8 + size
             if number not in layout.streams or size < 0 or place > layout.end:
                 # Without its size, nobody knows where the next packet begins.
