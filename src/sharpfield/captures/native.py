@@ -18,6 +18,7 @@ the note `poses = "unknown"` says that this is only a stand-in.
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,41 +68,60 @@ def write(capture: Capture, folder: Path | str) -> None:
     """
     folder = Path(folder)
     expect_replaceable(folder, recognise)
-    arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
     with replacing_folder(folder) as fresh:
-        about = {
-            "format": FORMAT,
-            "version": VERSION,
-            "name": capture.name,
-            "source": capture.source,
-            "near": float(capture.near),
-            "far": float(capture.far),
-            "camera": camera_table(capture.camera),
-            "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
-            "trajectory": write_trajectory(capture.trajectory, fresh),
-            "notes": {
-                k: note.item() if isinstance(note, np.generic) else note
-                for k, note in capture.notes.items()
-                if k not in arrays
-            },
-        }
+        frames = depth = None
         if capture.frames is not None:
-            about["frames"] = {
-                "encoding": capture.frames.encoding,
-                "each": write_frames(capture.frames, capture.split, fresh),
-            }
+            frames = write_frames(capture.frames, capture.split, fresh)
             if capture.depth is not None:
-                files = files_of(capture.frames.names)
-                about["depth"] = write_depth(capture.depth, files, fresh)
+                depth = write_depth(capture.depth, files_of(capture.frames.names), fresh)
         if capture.events is not None:
             write_events(fresh / EVENTS, capture.events)
         if capture.test_events is not None:
             write_events(fresh / TEST_EVENTS, capture.test_events)
-        if capture.points is not None:
-            np.save(fresh / POINTS, capture.points)
-        if arrays:
-            write_arrays(fresh / NOTES, arrays)
-        (fresh / DESCRIPTION).write_text(toml_text(about), encoding="utf-8")
+        describe(capture, fresh, frames=frames, depth=depth)
+
+
+def describe(
+    capture: Capture,
+    folder: Path,
+    *,
+    frames: list[dict[str, Any]] | None,
+    depth: dict[str, Any] | None = None,
+) -> None:
+    """Write all that is not pictures or events, for which these must be in the folder already.
+
+    Args:
+        capture: Of which images and events are not looked at.
+        folder: Where the description goes.
+        frames: The line of each frame, see `captures.native_frames`.
+        depth: The table of measured depth, see `captures.native_depth`.
+    """
+    arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
+    about: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": capture.name,
+        "source": capture.source,
+        "near": float(capture.near),
+        "far": float(capture.far),
+        "camera": camera_table(capture.camera),
+        "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
+        "trajectory": write_trajectory(capture.trajectory, folder),
+        "notes": {
+            k: note.item() if isinstance(note, np.generic) else note
+            for k, note in capture.notes.items()
+            if k not in arrays
+        },
+    }
+    if frames is not None:
+        about["frames"] = {"encoding": capture.needed_frames.encoding, "each": frames}
+    if depth is not None:
+        about["depth"] = depth
+    if capture.points is not None:
+        np.save(folder / POINTS, capture.points)
+    if arrays:
+        write_arrays(folder / NOTES, arrays)
+    (folder / DESCRIPTION).write_text(toml_text(about), encoding="utf-8")
 
 
 def read(folder: Path) -> Capture:

@@ -36,10 +36,19 @@ SHORT_US = 2**32 - 1
 class EventWriter:
     """Appends events to an open file; made by `writing_events`."""
 
-    def __init__(self, file: h5py.File, path: Path, like: EventStream, *, long: bool) -> None:
+    def __init__(
+        self,
+        file: h5py.File,
+        path: Path,
+        like: EventStream,
+        *,
+        long: bool,
+        origin_us: int | None = None,
+    ) -> None:
         self._file, self._path, self._like, self._long = file, path, like, long
         self._count = 0
-        self._offset_us = 0
+        self._origin_us = origin_us
+        self._offset_us = origin_us or 0
         self._last_us: int | None = None
         self._columns: dict[str, h5py.Dataset] = {}
         self._marks = file.create_dataset(
@@ -94,7 +103,8 @@ class EventWriter:
 
     def _begin(self, events: EventStream) -> None:
         """Make the columns, now that their types are known."""
-        self._offset_us = int(events.t_us[0]) // 1000 * 1000
+        if self._origin_us is None:
+            self._offset_us = int(events.t_us[0]) // 1000 * 1000
         kinds = {
             "x": events.x.dtype,
             "y": events.y.dtype,
@@ -117,7 +127,11 @@ class EventWriter:
 
 @contextmanager
 def writing_events(
-    path: Path | str, like: EventStream, *, span_us: int | None = None
+    path: Path | str,
+    like: EventStream,
+    *,
+    span_us: int | None = None,
+    origin_us: int | None = None,
 ) -> Iterator[EventWriter]:
     """A writer for `path`; the file appears when the block ends well, whole, or not at all.
 
@@ -125,6 +139,8 @@ def writing_events(
         path: Of the file, replaced if it exists.
         like: Any stream of the same sensor (it may be empty): its size and colour are written.
         span_us: Length of the recording, where it is known; a short one takes less memory to read.
+        origin_us: What stored times count from, not after the first event; by default the whole
+            ms before it.
     """
     path = Path(path)
     with replacing(path) as temporary:
@@ -142,7 +158,7 @@ def writing_events(
                 for name in ("x", "y", "channel"):
                     file[f"site_colour/{name}"] = getattr(like.site_colour, name)
             long = span_us is None or span_us > SHORT_US - 1000
-            writer = EventWriter(file, path, like, long=long)
+            writer = EventWriter(file, path, like, long=long, origin_us=origin_us)
             yield writer
             writer.finish()
 

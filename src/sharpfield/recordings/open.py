@@ -1,0 +1,233 @@
+"""Look at a file, recognise its format, and open it. A new format is one line in `FORMATS`.
+
+What a file begins with decides, and its name only where that says nothing. Where several formats
+fit, or the file leaves open what only its owner can know (the unit of times, the size of the
+sensor, which of several cameras), the error asks for it by the name of the option.
+"""
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.aedat4 import open_aedat4
+from sharpfield.recordings.evt import open_evt
+from sharpfield.recordings.hdf5 import open_hdf5
+from sharpfield.recordings.npz import open_npy, open_npz, open_npz_folder
+from sharpfield.recordings.recording import Recording
+from sharpfield.recordings.video import open_images, open_video
+from sharpfield.storage.images import list_images
+
+HEAD = 4096
+"""Bytes that are looked at."""
+
+Recognise = Callable[[Path, bytes], bool]
+"""Takes the path and what the file begins with, which is nothing for a folder."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file that cameras and programs write."""
+
+    recognise: Recognise
+    """Whether the content says that it is one."""
+    open: Callable[..., Recording]
+    holds: str
+    """What is read of it."""
+    marks: str
+    """By what it is recognised, in words."""
+    suffixes: tuple[str, ...] = ()
+    """Of files whose content says nothing."""
+    takes: tuple[str, ...] = ("size",)
+    """Options of `open_recording` that it knows."""
+
+
+def open_recording(
+    path: Path | str,
+    *,
+    layout: str | None = None,
+    unit: str | None = None,
+    size: tuple[int, int] | None = None,
+    topic: str | None = None,
+    columns: str | None = None,
+    per_second: float | None = None,
+    times: Path | None = None,
+) -> Recording:
+    """Open what a camera, or a program in its place, has written.
+
+    Args:
+        path: A file or a folder.
+        layout: One of `FORMATS`; by default it is recognised.
+        unit: Of the stored times (ns, us, ms, s), where the file does not say.
+        size: Width and height of the sensor in pixels, where the file does not say.
+        topic: Which of several cameras, streams or topics.
+        columns: What the columns of a table are, like "xytp".
+        per_second: How many frames were taken per second, where the file does not say.
+        times: A text that says when pictures were taken, where there are several.
+
+    Raises:
+        CaptureError: It is missing, of no known format, damaged, or leaves something open.
+        OptionError: An option does not belong to the format.
+    """
+    path = Path(path)
+    name = layout or format_of(path)
+    if name not in FORMATS:
+        raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
+    options: dict[str, Any] = {
+        "unit": unit,
+        "size": size,
+        "topic": topic,
+        "columns": columns,
+        "per_second": per_second,
+        "times": times,
+    }
+    given = {option: value for option, value in options.items() if value is not None}
+    for option in given.keys() - set(FORMATS[name].takes):
+        able = [other for other, known in FORMATS.items() if option in known.takes]
+        raise OptionError(
+            f"the format {name} has no option {option}",
+            where=path,
+            do=f"it belongs to {', '.join(able)}",
+        )
+    return FORMATS[name].open(path, **given)
+
+
+def open_events(
+    path: Path | str, *, unit: str | None = None, sensor: tuple[int, int] | None = None
+) -> Recording:
+    """Open a recording for its events; see `open_recording`.
+
+    Args:
+        path: A file or a folder.
+        unit: Of the stored times (ns, us, ms, s), where the file does not say.
+        sensor: Width and height in pixels, where the file does not say.
+
+    Raises:
+        CaptureError: See `open_recording`; or it holds no events.
+    """
+    opened = open_recording(path, unit=unit, size=sensor)
+    if opened.events is None:
+        raise CaptureError("the recording holds no events", where=path, got=opened.layout)
+    return opened
+
+
+def format_of(path: Path) -> str:
+    """The name of a file's format.
+
+    Raises:
+        CaptureError: There is no such file, or none or several formats fit.
+    """
+    if not path.exists():
+        raise CaptureError("recording not found", where=path)
+    if path.is_dir():
+        head = b""
+    else:
+        with path.open("rb") as file:
+            head = file.read(HEAD)
+    fitting = [name for name, known in FORMATS.items() if known.recognise(path, head)]
+    if not fitting and path.is_file():
+        fitting = [n for n, known in FORMATS.items() if path.suffix.lower() in known.suffixes]
+    if len(fitting) == 1:
+        return fitting[0]
+    marks = "; ".join(f"{known.marks} ({name})" for name, known in FORMATS.items())
+    if path.is_dir():
+        got = ", ".join(sorted(entry.name for entry in path.iterdir())[:8]) or "an empty folder"
+    else:
+        got = f"{path.stat().st_size} bytes, beginning with {head[:16]!r}"
+    if fitting:
+        raise CaptureError(
+            "several formats fit",
+            where=path,
+            got=", ".join(fitting),
+            do=f"choose a layout: {', '.join(fitting)}",
+        )
+    raise CaptureError("no known format", where=path, got=got, do=f"known are {marks}")
+
+
+def _begins(*magics: bytes) -> Recognise:
+    return lambda path, head: any(head.startswith(magic) for magic in magics)
+
+
+def _is_evt(path: Path, head: bytes) -> bool:
+    lines = [line.lower() for line in head.split(b"\n") if line.startswith(b"%")]
+    return any(line.startswith((b"% evt ", b"% format evt")) for line in lines)
+
+
+def _zipped(path: Path, head: bytes, suffix: str) -> bool:
+    """Whether a zip archive has a member of some name."""
+    if not head.startswith(b"PK\x03\x04"):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(suffix) for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError, NotImplementedError):
+        return path.suffix == f".{suffix}"
+
+
+def _is_video(path: Path, head: bytes) -> bool:
+    riff = head.startswith(b"RIFF") and head[8:11] == b"AVI"
+    return riff or head[4:8] == b"ftyp" or head.startswith(b"\x1aE\xdf\xa3")
+
+
+def _has_pictures(path: Path, head: bytes) -> bool:
+    if not path.is_dir() or (path / "events.txt").is_file():
+        return False
+    return (path / "images.txt").is_file() or bool(list_images(path))
+
+
+def _open_evt(path: Path, **given: Any) -> Recording:
+    return open_evt(path, **given)
+
+
+FORMATS: dict[str, Format] = {
+    "evt": Format(_is_evt, _open_evt, "events, triggers", "a header with `% evt`", (".raw",)),
+    "aedat4": Format(
+        _begins(b"#!AER-DAT4"),
+        open_aedat4,
+        "events, frames with exposures, triggers",
+        "`#!AER-DAT4`",
+        takes=("size", "topic"),
+    ),
+    "hdf5": Format(
+        _begins(b"\x89HDF\r\n\x1a\n"),
+        open_hdf5,
+        "events; frames of MVSEC and event_utils",
+        "HDF5",
+        takes=("size", "unit", "topic"),
+    ),
+    "npz": Format(
+        lambda path, head: _zipped(path, head, "npy"),
+        open_npz,
+        "events",
+        "npz",
+        takes=("size", "unit"),
+    ),
+    "npz-folder": Format(
+        lambda path, head: path.is_dir() and any(path.glob("*.npz")) and not list_images(path),
+        open_npz_folder,
+        "events",
+        "a folder of npz",
+        takes=("size", "unit"),
+    ),
+    "npy": Format(
+        _begins(b"\x93NUMPY"), open_npy, "events", "npy", takes=("size", "unit", "columns")
+    ),
+    "video": Format(
+        _is_video,
+        open_video,
+        "frames",
+        "mp4, avi, mkv",
+        (".mp4", ".avi", ".mov", ".mkv", ".webm"),
+        takes=("per_second",),
+    ),
+    "pictures": Format(
+        _has_pictures,
+        open_images,
+        "frames",
+        "a folder of PNG or JPEG",
+        takes=("unit", "per_second", "times"),
+    ),
+}
+"""Every format, by name."""
