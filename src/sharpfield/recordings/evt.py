@@ -18,6 +18,7 @@ from sharpfield.recordings.evt_decode import (
     REMEMBERED,
     ROOM,
     ROW,
+    STARTED,
     UNCONFIRMED,
     UNKNOWN,
     UNTIMED,
@@ -154,6 +155,7 @@ class _Decoder:
         self._state[ROW] = NO_ROW
         self._words = np.empty(0, encoding.word)
         self._odd = b""
+        self._untimed = 0
         self._room = Reorder()
         self._found = np.empty((EDGES, 3), np.int64)
         self.edges: list[Int64[np.ndarray, "n 3"]] = []
@@ -165,6 +167,13 @@ class _Decoder:
             yield from self._decode(last=False)
         yield from self._decode(last=True)
         self._trouble.note("torn words", int(len(self._odd) > 0))
+        if self._untimed and not self._state[STARTED]:
+            raise CaptureError(
+                f"there are no times in the data, as if they were no {self._encoding.name}",
+                where=self._where,
+                got=f"{self._untimed} events",
+                do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
+            )
         yield self._room.taken(last=True)
 
     def _take(self, block: bytes) -> None:
@@ -200,6 +209,7 @@ class _Decoder:
                 got=f"{self._state[UNKNOWN]} of {count} words are of no known type",
                 do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
             )
+        self._untimed += int(self._state[UNTIMED])
         for place, kind in COUNTS.items():
             self._trouble.note(kind, int(self._state[place]))
             self._state[place] = 0
@@ -244,7 +254,6 @@ def _halves_swapped(header: Header, path: Path) -> bool:
             got=order,
             do="convert the file with the maker's tools",
         )
+    maker = header.fields.get("integrator_name", "Prophesee")
     system = header.number("system_ID")
-    return (
-        bool(system) and system < LEGACY_BEFORE and "imx" in header.fields.get("plugin_name", "imx")
-    )
+    return maker == "Prophesee" and system is not None and 0 < system < LEGACY_BEFORE

@@ -62,48 +62,49 @@ def decode_evt2(words, state, last, columns, end, edges):
         How many words were used up, events there are now, and edges were found.
     """
     x, y, t, p = columns
-    found = 0
-    for i in range(words.size):
-        if end + ROOM > t.size or found == len(edges):
-            return i, end, found
+    e, found = np.uint64(end), 0
+    high, live = state[HIGH] << 6, state[STARTED] > 0
+    most = min(words.size, t.size - ROOM + 1 - end)
+    for i in range(most):
         word = np.int64(words[i])
         kind = word >> 28
         if kind <= 1:
-            if state[STARTED]:
-                x[end] = (word >> 11) & 0x7FF
-                y[end] = word & 0x7FF
-                t[end] = state[HIGH] << 6 | ((word >> 22) & 0x3F)
-                p[end] = 2 * kind - 1
-                end += 1
+            if live:
+                x[e], y[e] = (word >> 11) & 0x7FF, word & 0x7FF
+                t[e], p[e] = high | ((word >> 22) & 0x3F), 2 * kind - 1
+                e += np.uint64(1)
             else:
                 state[UNTIMED] += 1
         elif kind == 0x8:
             if not _advance(words, i, state, last, 28, 0):
-                return i, end, found
-        elif kind == 0xA:
-            if state[STARTED]:
-                _edge(edges, found, state[HIGH] << 6 | ((word >> 22) & 0x3F), word, 0x1F)
-                found += 1
+                return i, np.int64(e), found
+            high, live = state[HIGH] << 6, True
+        elif kind == 0xA and live:
+            if found == len(edges):
+                return i, np.int64(e), found
+            _edge(edges, found, high | ((word >> 22) & 0x3F), word, 0x1F)
+            found += 1
         elif kind <= 0x7 or kind == 0x9:
             state[UNKNOWN] += 1
-    return words.size, end, found
+    return most, np.int64(e), found
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def decode_evt21(words, state, last, columns, end, edges):
     """EVT2.1, from 64-bit words with the type on top; see `decode_evt2`."""
-    x, y, t, p = columns
+    limit = columns[2].size - ROOM
     found = 0
+    high, live = state[HIGH] << 6, state[STARTED] > 0
     for i in range(words.size):
-        if end + ROOM > t.size or found == len(edges):
+        if end > limit:
             return i, end, found
         word = np.int64(words[i] >> np.uint64(32))
         kind = word >> 28
         if kind <= 1:
             bits = np.int64(words[i] & np.uint64(0xFFFFFFFF))
-            if state[STARTED]:
-                time = state[HIGH] << 6 | ((word >> 22) & 0x3F)
+            if live:
+                time = high | ((word >> 22) & 0x3F)
                 column, row, sign = (word >> 11) & 0x7FF, word & 0x7FF, 2 * kind - 1
                 end = _vector(columns, end, bits, column, row, time, sign)
             else:
@@ -111,10 +112,12 @@ def decode_evt21(words, state, last, columns, end, edges):
         elif kind == 0x8:
             if not _advance(words, i, state, last, 60, 32):
                 return i, end, found
-        elif kind == 0xA:
-            if state[STARTED]:
-                _edge(edges, found, state[HIGH] << 6 | ((word >> 22) & 0x3F), word, 0x1F)
-                found += 1
+            high, live = state[HIGH] << 6, True
+        elif kind == 0xA and live:
+            if found == len(edges):
+                return i, end, found
+            _edge(edges, found, high | ((word >> 22) & 0x3F), word, 0x1F)
+            found += 1
         elif kind <= 0x7 or kind == 0x9 or (kind >= 0xB and kind <= 0xD):
             state[UNKNOWN] += 1
     return words.size, end, found
@@ -125,38 +128,39 @@ def decode_evt21(words, state, last, columns, end, edges):
 def decode_evt3(words, state, last, columns, end, edges):
     """EVT3, from 16-bit words; see `decode_evt2`."""
     x, y, t, p = columns
-    found = 0
-    used = words.size
-    row, time = state[ROW], state[HIGH] << 12 | state[LOW]
-    live = state[STARTED] and row >= 0
+    limit = t.size - ROOM
+    used, found = words.size, 0
+    row, base, sign = state[ROW], state[BASE], state[SIGN]
+    time = state[HIGH] << 12 | state[LOW]
+    live = state[STARTED] > 0 and row >= 0
     for i in range(words.size):
-        if end + ROOM > t.size or found == len(edges):
+        if end > limit:
             used = i
             break
         word = np.int64(words[i])
         kind = word >> 12
         if kind == 0x2:
             if live:
-                x[end], y[end], t[end] = word & 0x7FF, row, time
-                p[end] = ((word >> 10) & 2) - 1
+                e = np.uint64(end)
+                x[e], y[e], t[e], p[e] = word & 0x7FF, row, time, ((word >> 10) & 2) - 1
                 end += 1
             elif row != OTHER_ROW:
                 state[UNTIMED] += 1
         elif kind <= 0x1:
             row = word & 0x7FF if kind == 0 else OTHER_ROW
-            live = state[STARTED] and row >= 0
+            live = state[STARTED] > 0 and row >= 0
         elif kind == 0x6:
             state[LOW] = word & 0xFFF
             time = state[HIGH] << 12 | state[LOW]
         elif kind == 0x3:
-            state[BASE], state[SIGN] = word & 0x7FF, ((word >> 10) & 2) - 1
+            base, sign = word & 0x7FF, ((word >> 10) & 2) - 1
         elif kind <= 0x5:
             bits = word & (0xFFF if kind == 0x4 else 0xFF)
             if live:
-                end = _vector(columns, end, bits, state[BASE], row, time, state[SIGN])
+                end = _vector(columns, end, bits, base, row, time, sign)
             elif row != OTHER_ROW:
                 state[UNTIMED] += _ones(bits)
-            state[BASE] = min(state[BASE] + (12 if kind == 0x4 else 8), 0x7FFF)
+            base = min(base + (12 if kind == 0x4 else 8), 0x7FFF)
         elif kind == 0x8:
             before = state[HIGH]
             if not _advance(words, i, state, last, 12, 0):
@@ -165,13 +169,15 @@ def decode_evt3(words, state, last, columns, end, edges):
             state[LOW] = state[LOW] if state[HIGH] == before else 0
             time = state[HIGH] << 12 | state[LOW]
             live = row >= 0
-        elif kind == 0xA:
-            if state[STARTED]:
-                _edge(edges, found, time, word, 0xF)
-                found += 1
+        elif kind == 0xA and state[STARTED] > 0:
+            if found == len(edges):
+                used = i
+                break
+            _edge(edges, found, time, word, 0xF)
+            found += 1
         elif kind == 0x9 or kind == 0xB or kind == 0xC:
             state[UNKNOWN] += 1
-    state[ROW] = row
+    state[ROW], state[BASE], state[SIGN] = row, base, sign
     return used, end, found
 
 
@@ -187,13 +193,14 @@ def _edge(edges, found, time, word, channels):
 def _vector(columns, end, bits, column, row, time, sign):
     """Write an event for each set bit of a 32-bit mask, the lowest at `column`."""
     x, y, t, p = columns
+    e = np.uint64(end)  # unsigned: numba would look for negative indices
     while bits:
         lowest = bits & -bits
-        x[end] = column + LOWEST[(lowest * DE_BRUIJN & 0xFFFFFFFF) >> 27]
-        y[end], t[end], p[end] = row, time, sign
-        end += 1
+        x[e] = column + LOWEST[(lowest * DE_BRUIJN & 0xFFFFFFFF) >> 27]
+        y[e], t[e], p[e] = row, time, sign
+        e += np.uint64(1)
         bits ^= lowest
-    return end
+    return np.int64(e)
 
 
 @njit(cache=True, nogil=True)

@@ -2,7 +2,7 @@
 
 A file comes in packets, messages or blocks, of a few events or of millions. A reader turns each
 into a `Piece` and leaves the rest to `joined`, which drops and counts what cannot be (events
-outside the sensor, or earlier than those before them) and hands on chunks of one size.
+outside the sensor, or earlier than those before them) and hands on large chunks.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.recordings.recording import Chunks, Trouble
 
 CHUNK = 2**20
-"""Events in a chunk; the last one has fewer."""
+"""Most events in a chunk; all but the last one have at least half as many."""
 
 BACK_EVENTS, BACK_SHARE = 100, 0.01
 """Some cameras now and then deliver an event late. More than this many, and more than this share
@@ -47,7 +47,7 @@ class Piece:
 def joined(
     pieces: Iterator[Piece], size: tuple[int, int], *, where: object, trouble: Trouble
 ) -> Chunks:
-    """Sound chunks of `CHUNK` events, made of pieces of any size.
+    """Sound chunks of half to a whole `CHUNK` of events, made of pieces of any size.
 
     Args:
         pieces: In the order of the file.
@@ -63,6 +63,9 @@ def joined(
     count = 0
     for piece in pieces:
         sound = gate.passed(piece)
+        if not waiting and CHUNK // 2 <= len(sound) <= CHUNK:
+            yield _stream(sound, size)  # large enough as it is: not copied
+            continue
         waiting.append(sound)
         count += len(sound)
         if count < CHUNK:
