@@ -1,0 +1,109 @@
+"""`sharpfield poses`: find where the camera was, or attach what something else says of it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from tyro.conf import Positional
+
+from sharpfield.captures import native
+from sharpfield.captures.folders import expect_replaceable
+from sharpfield.captures.pose_layouts import OuterPath, PathLayout, read_hand_eye, read_path
+from sharpfield.captures.read import read_unposed
+from sharpfield.cli.poses_page import write_page
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.files import replacing
+from sharpfield.preparation.poses_external import Mount, attach, known_at
+from sharpfield.preparation.poses_find import PoseOptions, find_poses
+from sharpfield.preparation.poses_pictures import sharp_pictures
+from sharpfield.preparation.poses_report import as_text, summary
+
+FINDING = PoseOptions()
+REPORT, PAGE = "poses.json", "poses.html"
+
+
+def poses(
+    capture: Positional[Path],
+    out: Path,
+    trajectory: Path | None = None,
+    align: Path | None = None,
+    layout: PathLayout | None = None,
+    offset_ms: float = 0.0,
+    hand_eye: Path | None = None,
+    bounds: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
+    options: PoseOptions = FINDING,
+) -> None:
+    """Find where the camera was from the frames, deblurred with the events, or attach known poses.
+
+    Args:
+        capture: Folder of the capture; poses it has are not looked at.
+        out: Folder of the new capture, with `poses.json` and `poses.html`.
+        trajectory: A file of poses to take instead of finding them.
+        align: A file of poses whose world the poses found are to be brought into.
+        layout: Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap.
+        offset_ms: Added to the times of that file.
+        hand_eye: Where the camera sits on the body the file tracks (a matrix, or x y z qx qy qz
+            qw).
+        bounds: Nearest and farthest depth, with --trajectory, where the frames do not show them.
+        options: Pictures, lens.
+    """
+    if trajectory is not None and align is not None:
+        raise OptionError("give either --trajectory or --align", got=f"{trajectory} and {align}")
+    expect_replaceable(out, native.recognise)
+    original = read_unposed(capture)
+    mount = Mount(round(1000 * offset_ms), None if hand_eye is None else read_hand_eye(hand_eye))
+    if trajectory is not None:
+        _attach(original, read_path(trajectory, layout), mount, bounds, out)
+        return
+    known = None
+    if align is not None:
+        path = read_path(align, layout)
+        sharp = sharp_pictures(original, options.pictures, instants=options.instants)
+        known = known_at(path, mount, sharp.time_us)
+    found = find_poses(original, options, known=known)
+    native.write(replace(found.capture, name=out.name), out)
+    about = summary(original, found)
+    _write_json(out / REPORT, about)
+    write_page(out / PAGE, original, found, about)
+    console = Console()
+    console.print(as_text(about), highlight=False)
+    console.print(f"The capture with poses is in {out}; open {out / PAGE}", highlight=False)
+
+
+def _attach(
+    original: Capture,
+    path: OuterPath,
+    mount: Mount,
+    bounds: tuple[float, float] | None,
+    out: Path,
+) -> None:
+    attached = attach(original, path, mount, bounds=bounds)
+    made = attached.capture
+    native.write(replace(made, name=out.name), out)
+    names = () if original.frames is None else original.frames.names
+    lost = [names[i] for i in np.setdiff1d(np.arange(len(names)), attached.kept)]
+    about = {
+        "capture": original.name,
+        "poses_from": path.layout,
+        "poses": len(path.poses),
+        "offset_us": mount.offset_us,
+        "covered_us": attached.covered_us,
+        "frames": {"before": len(names), "after": len(attached.kept), "left_out": lost},
+        "bounds": {"near": made.near, "far": made.far},
+    }
+    _write_json(out / REPORT, about)
+    said = f"{len(path.poses)} poses ({path.layout}) attached; {len(attached.kept)} of"
+    said += f" {len(names)} frames and {len(made.events or ()):,} events are covered"
+    if lost:
+        said += f"; left out: {', '.join(lost[:8])}{', ...' if len(lost) > 8 else ''}"
+    Console().print(f"{said}\nThe capture with poses is in {out}", highlight=False)
+
+
+def _write_json(path: Path, about: dict[str, object]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(about, indent=2) + "\n")

@@ -1,0 +1,172 @@
+"""The page that `sharpfield poses` leaves beside the capture: pictures, points, path, numbers."""
+
+import html
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.files import replacing
+from sharpfield.evaluation import page
+from sharpfield.evaluation.figures import trajectory_figure
+from sharpfield.evaluation.page import Look, Picture, View, section
+from sharpfield.evaluation.tables import Table, as_html
+from sharpfield.preparation.poses_find import PosesFound
+
+LOOK = Look(640, 82)
+SHOWN = 6
+"""Pictures shown, beside all that failed up to as many."""
+GREEN, AMBER = (40, 200, 90), (245, 160, 40)
+ZOOM = 2
+"""Small pictures are enlarged, so that marks on them can be told apart."""
+SMALL = 480
+
+
+def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str, Any]) -> None:
+    """Write the page.
+
+    Args:
+        path: Where.
+        original: The capture before.
+        found: What was found.
+        about: Its summary.
+    """
+    body = "\n".join(
+        part
+        for part in (
+            _header(about),
+            _failures(about),
+            _pictures(original, found),
+            section(
+                "The path",
+                page.drawing(
+                    trajectory_figure(found.capture),
+                    "Where the camera was: thick where the shutter was open, ticks where it"
+                    " looked; orange to learn from, blue held out.",
+                ),
+            ),
+            _table(about),
+        )
+        if part
+    )
+    with replacing(path) as temporary:
+        temporary.write_text(page.page(f"{about['capture']}: poses", body), encoding="utf-8")
+
+
+def _header(about: dict[str, Any]) -> str:
+    points, camera = about["points"], about["camera"]
+    values = [
+        (f"{about['registered']} of {about['pictures']}", "pictures with a pose", "registered"),
+        (f"{about['error_px']:.2f} px", "reprojection error", "mean over pictures"),
+        (
+            f"{points['map']:,}",
+            "points",
+            f"each seen in {points['mean_track_length']:.1f} pictures",
+        ),
+        (f"{camera['focal_px'][0]:.1f} px", "focal length", str(camera["from"])),
+        (
+            f"{about['bounds']['near']:.3g} … {about['bounds']['far']:.3g}",
+            "near and far",
+            "median depth of the points is 1"
+            if about["off_known_positions"] is None
+            else "in units of the known positions",
+        ),
+    ]
+    told = {
+        "edi": "frames deblurred with their events",
+        "frames": "frames as they are",
+        "sharpest": "the sharpest of each three frames",
+    }[about["pictures_from"]]
+    return (
+        f'<header>\n<p class="eyebrow">sharpfield poses</p>\n<h1>{html.escape(about["capture"])}'
+        f'</h1>\n<p class="subtitle">From {told}</p>\n{page.cards(values)}</header>'
+    )
+
+
+def _failures(about: dict[str, Any]) -> str:
+    rows = tuple(
+        (one["frame"], str(one["features"]), str(one["matches"]), one["why"], one["do"])
+        for one in about["each"]
+        if not one["registered"]
+    )
+    if not rows:
+        return ""
+    table = Table(("picture", "features", "matches", "why it has no pose", "what to try"), rows)
+    return section("Without a pose", as_html(table))
+
+
+def _pictures(original: Capture, found: PosesFound) -> str:
+    lost = np.flatnonzero(~found.map.registered)[:SHOWN]
+    good = np.flatnonzero(found.map.registered)
+    spread = good[np.unique(np.linspace(0, len(good) - 1, SHOWN).round().astype(int))]
+    views = [_view(original, found, int(i)) for i in [*lost, *spread]]
+    return section(
+        "What was seen",
+        page.comparison(views, LOOK, left="recorded", right="used"),
+        intro="Recorded frames, and the pictures poses were found from with the points seen in"
+        " them: green within a pixel of where they project, amber farther.",
+    )
+
+
+def _view(original: Capture, found: PosesFound, picture: int) -> View:
+    frame = int(found.sharp.frame[picture])
+    name = original.needed_frames.names[frame]
+    held = original.needed_frames
+    recorded = np.rint(np.asarray(held.images[frame], np.float64) * (255 / held.white))
+    said = (
+        f"{name}, used: {found.map.error_px[picture]:.2f} px"
+        if found.map.registered[picture]
+        else f"{name}: no pose"
+    )
+    return View(
+        f"{name} ({picture})",
+        (
+            Picture("recorded", _large(recorded.astype(np.uint8)), name, f"{name} as recorded"),
+            Picture("used", _marked(found, picture), said, f"{name} with the points seen in it"),
+        ),
+    )
+
+
+def _marked(found: PosesFound, picture: int) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with the points of the map projected into it."""
+    shown = np.ascontiguousarray(_large(found.sharp.pictures[picture]))
+    if not found.map.registered[picture]:
+        return shown
+    rows = found.map.sightings[found.map.sightings[:, 0] == picture, 1]
+    pose = found.map.poses[picture]
+    local = (found.map.points[rows] - pose[:, 3]) @ pose[:, :3]
+    xy = found.map.camera.project(torch.from_numpy(local)).numpy() * (
+        shown.shape[1] / found.map.camera.width
+    )
+    for (x, y), error in zip(xy, found.map.point_error_px[rows], strict=True):
+        colour = GREEN if error < 1 else AMBER
+        cv2.circle(shown, (round(x), round(y)), 3, colour, 1, cv2.LINE_AA)
+    return shown
+
+
+def _large(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """In three channels, and large enough to look at."""
+    colour = np.repeat(picture, 3, -1) if picture.shape[-1] == 1 else picture
+    if max(colour.shape) >= SMALL:
+        return colour
+    return cv2.resize(colour, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC)
+
+
+def _table(about: dict[str, Any]) -> str:
+    rows = tuple(
+        (
+            one["frame"],
+            f"{one['time_us'] / 1000:.1f}",
+            str(one["features"]),
+            str(one["partners"]),
+            str(one["points"]),
+            "–" if one["error_px"] is None else f"{one['error_px']:.2f}",
+        )
+        for one in about["each"]
+    )
+    table = Table(("frame", "time, ms", "features", "partners", "points", "error, px"), rows)
+    return section("Each picture", page.folded_if_long("All pictures", as_html(table), len(rows)))
