@@ -9,7 +9,7 @@ the same unwrapped. Times are in us: the counter counts 64 us (EVT2, EVT2.1) or 
 
 A decoder is a loop over words that keeps all it knows in an array of numbers, so that a file may
 be cut into blocks anywhere. It stops early when there is no room for what it finds, or when it
-has to see the words after a block to judge one in it (see `_far`).
+has to see the words after a block to judge one in it (see `is_lone`).
 
 Source: Prophesee, *EVT 2.0*, *EVT 2.1* and *EVT 3.0 format* (Metavision documentation). A new
 counter in EVT3 sets the low part to zero until its own word comes, a repeated one does not.
@@ -223,21 +223,21 @@ def _advance(words, i, state, last, kind_at, counter_at):
     if not state[STARTED]:
         state[HIGH], state[STARTED] = counter, 1
         return True
-    step = _step(state[HIGH] & mask, counter, mask, near)
-    if abs(step) > near:
+    ahead = step(state[HIGH] & mask, counter, mask, near)
+    if abs(ahead) > near:
         following = _following(words, i, last, kind_at, counter_at, mask)
         if following == -2:
             return False
-        if following >= 0 and _far(state[HIGH] & mask, counter, following, mask, near):
+        if following >= 0 and is_lone(state[HIGH] & mask, counter, following, mask, near):
             state[UNCONFIRMED] += 1
             return True
-    state[HIGH] += step
+    state[HIGH] += ahead
     return True
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _step(before, counter, mask, near):
+def step(before, counter, mask, near):
     """How far a counter went on, or back (negative), wraps undone."""
     ahead = (counter - before) & mask
     back = mask + 1 - ahead
@@ -248,13 +248,13 @@ def _step(before, counter, mask, near):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _far(before, counter, following, mask, near):
+def is_lone(before, counter, following, mask, near):
     """Whether a counter is a lone outlier: the next one goes on from the one before.
 
     One wrong bit would otherwise make time jump and, once it jumps back, pass for a wrap.
     """
-    goes_on = abs(_step(before, following, mask, near)) <= near
-    return goes_on and abs(_step(counter, following, mask, near)) > near
+    goes_on = abs(step(before, following, mask, near)) <= near
+    return goes_on and abs(step(counter, following, mask, near)) > near
 
 
 @njit(cache=True, nogil=True)
