@@ -8,10 +8,11 @@ from collections.abc import Sequence
 
 import torch
 from torch import nn
-from torch.optim import Adam, Optimizer
+from torch.optim import Optimizer
 
 from sharpfield.core.protocols import Model
 from sharpfield.core.schedule import Group
+from sharpfield.training.row_adam import RowAdam
 
 FUSED = ("cpu", "cuda")
 """Devices on which torch updates all parameters of a group in one kernel."""
@@ -28,7 +29,7 @@ def device_of(model: Model) -> torch.device:
     return next(module_of(model).parameters()).device
 
 
-def adam(model: Model) -> Adam:
+def adam(model: Model) -> RowAdam:
     """Adam over the model's groups, with the rates of step 0.
 
     A parameter that wants gradients and belongs to no group would silently never move; that is an
@@ -52,7 +53,7 @@ def adam(model: Model) -> Adam:
         for group in groups
         if group.parameters
     ]
-    return Adam(described, betas=(0.9, 0.999), eps=1e-8, fused=fused)
+    return RowAdam(described, betas=(0.9, 0.999), eps=1e-8, fused=fused)
 
 
 def set_rates(optimizer: Optimizer, groups: Sequence[Group], step: int) -> None:

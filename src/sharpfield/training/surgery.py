@@ -65,6 +65,8 @@ def _restarted(copied: Tensor, new: Tensor, growth: Growth) -> Tensor:
 
 def _moved(value: Tensor, parameter: Tensor, growth: Growth, restarted: Tensor) -> Tensor:
     """A moment of the new parameter; what has no rows belongs to the parameter as a whole."""
-    if value.shape != parameter.shape:
-        return value
-    return value[growth.source].masked_fill_(restarted, 0)
+    if value.shape == parameter.shape:
+        return value[growth.source].masked_fill_(restarted, 0)
+    if value.shape == parameter.shape[:1]:
+        return value[growth.source].masked_fill_(growth.fresh, 0)
+    return value

@@ -1,0 +1,266 @@
+"""Points near a place, and the parts of a ray that pass near points, among millions of points.
+
+Vocabulary: space is cut into cubic *cells*, and 4x4x4 cells make a *brick*. Only bricks near points
+are kept: a small *table* of all bricks tells which. Points are listed cell after cell. A cell is
+*near* if it, or one of the cells around it (the *window*), holds a point. All of it is made once
+for points that stay where they are; memory and time grow with the points and not with the space
+between them.
+
+Source: the query of Point-NeRF (CVPR 2022), section 4.1, which rebuilds a dense grid for every
+batch, keeps a random choice of points where a cell is full, and stops at the first cells that hold
+enough; here neighbours are those that are truly nearest in the window.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int32, Int64
+from torch import Tensor
+
+from sharpfield.core.errors import OptionError
+from sharpfield.ops._dispatch import Op
+
+SIDE = 4
+"""Cells along the edge of a brick."""
+
+BRICK = SIDE**3
+"""Cells of a brick."""
+
+MOST_BRICKS = 1 << 28
+"""Of the table: 1 GiB."""
+
+CHUNK = 1 << 14
+"""Queries that the definition works on at once."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Points sorted into cells."""
+
+    origin: tuple[float, float, float]
+    """Low corner of the first cell."""
+    edge: float
+    """Of a cell, in world units."""
+    reach: int
+    """The window is this many cells wide to each side."""
+    table: Int32[Tensor, "x y z"]
+    """Number of each brick; -1 where no point is near."""
+    start: Int32[Tensor, "m"]
+    """Where the list of each cell begins; cell c of brick b is 64 b + c. Ends with their count."""
+    near: Bool[Tensor, "k"]
+    """Cells that have points in their window."""
+    order: Int64[Tensor, "n"]
+    """The points, cell after cell."""
+    places: Float[Tensor, "n 3"]
+    """Where they are, in that order."""
+
+
+def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1) -> Cells:
+    """Make the lists in which neighbours are looked up.
+
+    Args:
+        points: At least one.
+        edge: Of a cell. Neighbours within `reach * edge` are all found; farther ones only if they
+            are in the window.
+        reach: How many cells the window extends to each side.
+
+    Raises:
+        OptionError: Points are spread over more bricks than the table may have.
+    """
+    points = points.detach()
+    low = points.amin(0) - (reach + 0.5) * edge
+    cell = ((points - low) / edge).floor().long()
+    bricks = [(int(most) + reach) // SIDE + 1 for most in cell.amax(0)]
+    if bricks[0] * bricks[1] * bricks[2] > MOST_BRICKS:
+        extent = (points.amax(0) - points.amin(0)).tolist()
+        raise OptionError(
+            "points are spread too far for cells so small",
+            got=f"{len(points)} points over {extent[0]:.3g} x {extent[1]:.3g} x {extent[2]:.3g}"
+            f" in cells of {edge:.3g}",
+            do="take larger voxels, or leave out points that lie far off",
+        )
+    key = _key(cell, bricks)
+    key, order = key.sort(stable=True)
+    held, count = torch.unique_consecutive(key, return_counts=True)
+    keys = [held] if reach == 0 else [_key(c, bricks) for c in _around(held, bricks, reach)]
+    marked = torch.zeros(bricks[0] * bricks[1] * bricks[2], dtype=torch.bool, device=key.device)
+    for one in keys:
+        marked[one // BRICK] = True
+    number = torch.where(marked, marked.cumsum(0) - 1, -1)
+    cells = int(marked.sum()) * BRICK
+    near = torch.zeros(cells, dtype=torch.bool, device=key.device)
+    for one in keys:
+        near[number[one // BRICK] * BRICK + one % BRICK] = True
+    counts = torch.zeros(cells + 1, dtype=torch.int64, device=key.device)
+    counts[number[held // BRICK] * BRICK + held % BRICK + 1] = count
+    x, y, z = low.tolist()
+    return Cells(
+        origin=(x, y, z),
+        edge=edge,
+        reach=reach,
+        table=number.int().view(*bricks),
+        start=counts.cumsum(0).int(),
+        near=near,
+        order=order,
+        places=points[order].contiguous(),
+    )
+
+
+def window(reach: int) -> list[tuple[int, int, int]]:
+    """Offsets of the cells of a window: the own one first."""
+    steps = range(-reach, reach + 1)
+    around = [(x, y, z) for x in steps for y in steps for z in steps]
+    return sorted(around, key=lambda step: step != (0, 0, 0))
+
+
+@Op
+def neighbours(
+    queries: Float[Tensor, "q 3"],
+    points: Float[Tensor, "n 3"],
+    cells: Cells,
+    most: int,
+    radius: float,
+) -> tuple[Int64[Tensor, "q k"], Float[Tensor, "q k 3"]]:
+    """The nearest points within a radius, in the window of each query's cell.
+
+    Args:
+        queries: Anywhere; outside of all bricks nothing is found.
+        points: Those that were sorted into cells.
+        cells: Made of the points.
+        most: The number k of neighbours.
+        radius: They are closer than this.
+
+    Returns:
+        Rows of the points, near to far, -1 where there are no more; and the way from the query to
+        each of them, zero where there is none.
+    """
+    parts = [_nearest(part, cells, most, radius) for part in queries.detach().split(CHUNK)]
+    rows = torch.cat(parts) if parts else queries.new_zeros(0, most, dtype=torch.int64)
+    return rows, ways(queries, points, rows)
+
+
+@neighbours.exemplify
+def _near_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
+    points = torch.rand(150 * size, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.2])
+    queries = torch.rand(40 * size, 3, generator=generator) * torch.tensor([1.2, 1.2, 0.2]) - 0.1
+    return queries, points, sort_into_cells(points, 0.1), 6, 0.15
+
+
+@Op
+def first_near(
+    origin: Float[Tensor, "b 3"],
+    direction: Float[Tensor, "b 3"],
+    place: Float[Tensor, "b d"],
+    cells: Cells,
+    most: int,
+) -> tuple[Int64[Tensor, "b s"], Float[Tensor, "b s 3"]]:
+    """The first places on rays that lie in cells near points.
+
+    Args:
+        origin: Of rays.
+        direction: Of one unit of `place`.
+        place: Ray parameters to choose from, ascending.
+        cells: Made of the points.
+        most: The number s of places for each ray.
+
+    Returns:
+        Which of the places, -1 where there are no more; and where in space they are, zero where
+        there are none.
+    """
+    at = along(origin.detach(), direction.detach(), place.detach())
+    near = _cell_of(at, cells) >= 0
+    near &= cells.near[_cell_of(at, cells).clamp_min(0)]
+    first = near.byte().argsort(dim=-1, descending=True, stable=True)[:, :most]
+    first = torch.where(near.gather(-1, first), first, -1)
+    first = torch.nn.functional.pad(first, (0, most - first.shape[1]), value=-1)
+    return first, chosen(origin, direction, place, first)
+
+
+@first_near.exemplify
+def _march_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
+    points = torch.rand(60 * size, 3, generator=generator)
+    origin = torch.rand(10 * size, 3, generator=generator) - torch.tensor([0.0, 0.0, 1.5])
+    toward = torch.tensor([0.0, 0.0, 1.0]) + 0.2 * torch.randn(10 * size, 3, generator=generator)
+    place = 3 * torch.rand(10 * size, 50, generator=generator).sort(-1).values
+    return origin, toward, place, sort_into_cells(points, 0.08), 7
+
+
+def ways(
+    queries: Float[Tensor, "q 3"], points: Float[Tensor, "n 3"], rows: Int64[Tensor, "q k"]
+) -> Float[Tensor, "q k 3"]:
+    """From queries to their neighbours; zero where there is none."""
+    to = points.index_select(0, rows.clamp_min(0).flatten()).view(*rows.shape, 3)
+    return (to - queries[:, None]) * (rows >= 0)[..., None]
+
+
+def along(
+    origin: Float[Tensor, "b 3"], direction: Float[Tensor, "b 3"], place: Float[Tensor, "b s"]
+) -> Float[Tensor, "b s 3"]:
+    """Points on rays."""
+    return origin[:, None] + place[..., None] * direction[:, None]
+
+
+def chosen(
+    origin: Float[Tensor, "b 3"],
+    direction: Float[Tensor, "b 3"],
+    place: Float[Tensor, "b d"],
+    which: Int64[Tensor, "b s"],
+) -> Float[Tensor, "b s 3"]:
+    """Points on rays at some of the places; zero where there is none."""
+    at = along(origin, direction, place.gather(-1, which.clamp_min(0)))
+    return at * (which >= 0)[..., None]
+
+
+def _key(cell: Int64[Tensor, "n 3"], bricks: list[int]) -> Int64[Tensor, "n"]:
+    """One number for each cell, brick after brick."""
+    x, y, z = (cell // SIDE).unbind(-1)
+    brick = (x * bricks[1] + y) * bricks[2] + z
+    x, y, z = (cell % SIDE).unbind(-1)
+    return brick * BRICK + (x * SIDE + y) * SIDE + z
+
+
+def _around(key: Int64[Tensor, "n"], bricks: list[int], reach: int) -> list[Int64[Tensor, "n 3"]]:
+    """The cells around some, one list for each step of the window."""
+    brick, inner = key // BRICK, key % BRICK
+    at = [
+        brick // (bricks[1] * bricks[2]) * SIDE + inner // SIDE**2,
+        brick // bricks[2] % bricks[1] * SIDE + inner // SIDE % SIDE,
+        brick % bricks[2] * SIDE + inner % SIDE,
+    ]
+    cell = torch.stack(at, -1)
+    return [cell + cell.new_tensor(step) for step in window(reach)]
+
+
+def _cell_of(places: Float[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
+    """Number of the cell around each place, -1 where no point is near."""
+    low = places.new_tensor(cells.origin)
+    return _number(((places - low) / cells.edge).floor().long(), cells)
+
+
+def _number(cell: Int64[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
+    bricks = list(cells.table.shape)
+    inside = ((cell >= 0) & (cell < SIDE * cell.new_tensor(bricks))).all(-1)
+    key = _key(torch.where(inside[..., None], cell, 0).reshape(-1, 3), bricks).view(inside.shape)
+    brick = cells.table.flatten()[key // BRICK].long()
+    return torch.where(inside & (brick >= 0), brick * BRICK + key % BRICK, -1)
+
+
+def _nearest(
+    queries: Float[Tensor, "q 3"], cells: Cells, most: int, radius: float
+) -> Int64[Tensor, "q k"]:
+    """Rows of the nearest points of a few queries, by looking at all points of their windows."""
+    own = ((queries - queries.new_tensor(cells.origin)) / cells.edge).floor().long()
+    steps = torch.tensor(window(cells.reach), device=queries.device)
+    cell = _number(own[:, None] + steps, cells)  # [q, w]
+    begin = cells.start.long()[cell.clamp_min(0)]
+    count = torch.where(cell >= 0, cells.start.long()[cell.clamp_min(0) + 1] - begin, 0)
+    slot = torch.arange(max(int(count.max()), 1) if len(cell) else 1, device=queries.device)
+    there = (slot < count[..., None]).flatten(1)
+    item = (begin[..., None] + slot).flatten(1).clamp_max(len(cells.order) - 1)
+    away = (cells.places.to(queries.dtype)[item] - queries[:, None]).square().sum(-1)
+    away = torch.where(there & (away < radius**2), away, torch.inf)
+    away = torch.nn.functional.pad(away, (0, most), value=torch.inf)
+    item = torch.nn.functional.pad(item, (0, most))
+    away, best = away.sort(dim=-1, stable=True)
+    rows = cells.order[item.gather(-1, best[:, :most])]
+    return torch.where(away[:, :most].isfinite(), rows, -1)

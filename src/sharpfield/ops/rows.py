@@ -1,0 +1,50 @@
+"""A few rows of a large table, with a gradient that is as small as what was taken.
+
+The gradient of indexing a tensor is a tensor of zeros as large as the whole. Here it is *sparse*:
+it holds the rows that were taken and says which they are, so that neither memory nor an optimizer
+that knows of it (`training.row_adam`) ever touches the others.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def take_rows(table: Float[Tensor, "n f"], rows: Int64[Tensor, "m"]) -> Float[Tensor, "m f"]:
+    """The rows of a table that are asked for.
+
+    Args:
+        table: Of any length.
+        rows: Ascending, without repetition, see `compact`.
+    """
+    apply: Callable[..., Tensor] = _TakeRows.apply  # pyright: ignore[reportUnknownMemberType]
+    return apply(table, rows)
+
+
+def compact(rows: Int64[Tensor, "*b"]) -> tuple[Int64[Tensor, "m"], Int64[Tensor, "*b"]]:
+    """The rows that occur, ascending and once each, and where in that list each one is."""
+    taken, place = torch.unique(rows, return_inverse=True)
+    return taken, place
+
+
+class _TakeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(rows)
+        ctx.shape = table.shape
+        return table.index_select(0, rows)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx: Any, *gradients: Tensor
+    ) -> tuple[Tensor, None]:
+        (rows,) = ctx.saved_tensors
+        sparse = torch.sparse_coo_tensor(
+            rows[None], gradients[0], ctx.shape, is_coalesced=True, check_invariants=False
+        )
+        return sparse, None
