@@ -6,7 +6,13 @@ from sharpfield.core.errors import CaptureError, OptionError
 
 
 @pytest.mark.parametrize(
-    ("rule", "test"), [("every:8", [0, 8, 16]), ("last:5", [13, 14, 15, 16, 17]), ("none", [])]
+    ("rule", "test"),
+    [
+        ("every:8", [0, 8, 16]),
+        ("train:8", [1, 2, 3, 4, 5, 6, 7, 9, 10, 11, 12, 13, 14, 15, 17]),
+        ("last:5", [13, 14, 15, 16, 17]),
+        ("none", []),
+    ],
 )
 def test_the_rules(rule, test):
     split = split_by_rule(18, rule)
@@ -16,7 +22,7 @@ def test_the_rules(rule, test):
 
 @pytest.mark.parametrize("rule", ["every", "every:0", "first:3", "last:-1", "every:8 "])
 def test_a_rule_that_cannot_be_read(rule):
-    with pytest.raises(OptionError, match="write every:8, last:5 or none"):
+    with pytest.raises(OptionError, match="write every:8, train:5, last:5 or none"):
         split_by_rule(18, rule)
 
 

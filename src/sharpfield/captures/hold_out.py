@@ -1,6 +1,7 @@
 """Rules by which published data sets hold out frames for testing.
 
-A rule is written `every:8` (frames 0, 8, 16, ...), `last:5` or `none`.
+A rule is written `every:8` (frames 0, 8, 16, ...), `train:5` (all but frames 0, 5, 10, ...),
+`last:5` or `none`.
 """
 
 import re
@@ -10,7 +11,7 @@ import numpy as np
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import CaptureError, OptionError
 
-RULE = re.compile(r"(?P<kind>every|last):(?P<number>[1-9][0-9]*)|none")
+RULE = re.compile(r"(?P<kind>every|train|last):(?P<number>[1-9][0-9]*)|none")
 
 
 def split_by_rule(count: int, rule: str) -> Split:
@@ -23,12 +24,16 @@ def split_by_rule(count: int, rule: str) -> Split:
     match = RULE.fullmatch(rule)
     if match is None:
         raise OptionError(
-            "unknown rule of what to hold out", got=rule, do="write every:8, last:5 or none"
+            "unknown rule of what to hold out",
+            got=rule,
+            do="write every:8, train:5, last:5 or none",
         )
     every = np.arange(count, dtype=np.int64)
     number = int(match["number"] or 0)
     if match["kind"] == "every":
         held_out = every % number == 0
+    elif match["kind"] == "train":
+        held_out = every % number != 0
     else:
         held_out = every >= count - number
     if held_out.all():

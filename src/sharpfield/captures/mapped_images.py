@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Shaped
@@ -24,17 +25,21 @@ IN_MEMORY = 256_000_000
 
 Stack = Shaped[np.ndarray, "n ..."]
 Pixels = Shaped[np.ndarray, "..."]
-Decode = Callable[[Path], Pixels]
-"""The pixels of a file."""
+
+Item = TypeVar("Item")
 
 
 def mapped_images(
-    paths: Sequence[Path], decode: Decode, *, kind: str, in_memory: int = IN_MEMORY
+    paths: Sequence[Path],
+    decode: Callable[[Path], Pixels],
+    *,
+    kind: str,
+    in_memory: int = IN_MEMORY,
 ) -> Stack:
-    """All images as one array; memory-mapped, read only, if there are many.
+    """All images of a folder as one array; memory-mapped, read only, if there are many.
 
     Args:
-        paths: Files, at least one.
+        paths: Files, at least one, in one folder.
         decode: How to read one; all must come out in one shape and type.
         kind: What they are and how they were decoded, e.g. "colour 640x480": part of the cache's
             name.
@@ -43,37 +48,60 @@ def mapped_images(
     Raises:
         CaptureError: There are none, one cannot be read, or they differ in shape or type.
     """
-    if not paths:
+    return mapped(paths, decode, sources=paths, kind=kind, in_memory=in_memory)
+
+
+def mapped(
+    items: Sequence[Item],
+    decode: Callable[[Item], Pixels],
+    *,
+    sources: Sequence[Path],
+    kind: str,
+    in_memory: int = IN_MEMORY,
+) -> Stack:
+    """The same for images that have no files of their own.
+
+    Args:
+        items: What names an image to `decode`.
+        decode: Gives its pixels.
+        sources: Files that the images come from; the cache lies where they do.
+        kind: See `mapped_images`.
+        in_memory: How many bytes may be loaded.
+    """
+    if not items:
         raise CaptureError("there are no images to read")
-    first = decode(paths[0])
-    shape = (len(paths), *first.shape)
-    if first.nbytes * len(paths) <= in_memory:
+    first = decode(items[0])
+    shape = (len(items), *first.shape)
+    if first.nbytes * len(items) <= in_memory:
         images = np.empty(shape, first.dtype)
-        _fill(images, paths, decode, first)
+        _fill(images, items, decode, first)
         return images
-    place = cache_folder(paths[0].parent) / f"images-{_key(paths, kind)}.npy"
+    named = f"{kind}/{len(items)}"
+    place = cache_folder(sources[0].parent) / f"images-{_key(sources, named)}.npy"
     if not place.exists():
         with replacing(place) as temporary:
             images = np.lib.format.open_memmap(temporary, "w+", first.dtype, shape)
-            _fill(images, paths, decode, first)
+            _fill(images, items, decode, first)
             images.flush()
     return np.load(place, mmap_mode="r")
 
 
-def _fill(images: Stack, paths: Sequence[Path], decode: Decode, first: Pixels) -> None:
+def _fill(
+    images: Stack, items: Sequence[Item], decode: Callable[[Item], Pixels], first: Pixels
+) -> None:
     def place(i: int) -> None:
-        image = decode(paths[i]) if i else first
+        image = decode(items[i]) if i else first
         if image.shape != first.shape or image.dtype != first.dtype:
             raise CaptureError(
                 "images differ in size or type",
-                where=f"{paths[0]} and {paths[i]}",
+                where=f"{items[0]} and {items[i]}",
                 got=f"{first.shape} {first.dtype} and {image.shape} {image.dtype}",
                 do="a capture has one camera: bring all images to one size, bit depth and colour",
             )
         images[i] = image
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
-        for _ in pool.map(place, range(len(paths))):
+        for _ in pool.map(place, range(len(items))):
             pass
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sharpfield.captures import (
+    arkitscenes,
     colmap,
     d_nerf,
     deblur_nerf,
@@ -15,6 +16,9 @@ from sharpfield.captures import (
     nerf_synthetic,
     nerfstudio,
     robust_e_nerf,
+    scannet,
+    sens_file,
+    seven_scenes,
 )
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.photos import Missing
@@ -63,6 +67,14 @@ LAYOUTS: dict[str, Layout] = {
         robust_e_nerf.read,
         "raw_events.npz, camera_poses.npz and camera_calibration.npz",
     ),
+    "scannet": Layout(
+        scannet.recognise, scannet.read, "color/, pose/ and intrinsic/intrinsic_color.txt"
+    ),
+    "sens": Layout(sens_file.recognise, sens_file.read, "one .sens file"),
+    "arkitscenes": Layout(
+        arkitscenes.recognise, arkitscenes.read, "lowres_wide/ and lowres_wide.traj"
+    ),
+    "7-scenes": Layout(seven_scenes.recognise, seven_scenes.read, "frame-*.color.png"),
     "d-nerf": Layout(
         d_nerf.recognise,
         d_nerf.read,
@@ -127,7 +139,8 @@ def read(
         event_unit: Unit of the event times (ns, us, ms, s), where it is not what the layout has.
         missing: Whether images that are named but not there are an "error" or to "skip".
         encoding: How stored values relate to light (see `Frames`), where the layout is wrong.
-        hold_out: Frames to hold out: `every:8`, `last:5` or `none`; by default as the layout says.
+        hold_out: Frames to hold out: `every:8`, `train:5`, `last:5` or `none`; by default as the
+            layout says.
         threshold: Contrast threshold of the events for both signs, where it is known better.
         trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
             are built from them, and anything else is refused.

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from tyro.conf import Positional
 
-from sharpfield.captures import native, write_evdnerf, write_llff_events
+from sharpfield.captures import native, write_evdnerf, write_llff_events, write_scannet
 from sharpfield.captures.read import read_unposed
 from sharpfield.captures.summary import summary
 from sharpfield.core.capture import Capture
@@ -171,6 +171,8 @@ def simulate(
     _known("motion", recording.motion, MOTIONS)
     if scene == ROOM:
         rig = recording.sensors(ROOM_RIG, parse_size(size or ROOM_SIZE))
+        if layout == "scannet":  # whose photos are sRGB
+            rig = replace(rig, frame_sensor=replace(rig.frame_sensor, encoding="srgb"))
         made = simulate_room(rig=rig, timing=recording.walk.timing(timing, layout), seed=seed)
     elif scene in MOVING_SCENES:
         rig = recording.sensors(MOVING_RIG, parse_size(size or MOVING_SIZE))
@@ -251,7 +253,12 @@ def deblur(
 
 def write(capture: Capture, out: Path, layout: str) -> None:
     """Write a capture in a layout."""
-    writers = {"native": native, "ev-deblur-nerf": write_llff_events, "evdnerf": write_evdnerf}
+    writers = {
+        "native": native,
+        "ev-deblur-nerf": write_llff_events,
+        "evdnerf": write_evdnerf,
+        "scannet": write_scannet,
+    }
     writers[layout].write(capture, out)
 
 

@@ -45,7 +45,7 @@ class Reading:
     encoding: str | None = None
     """How stored values relate to light: linear, gamma2.2 or srgb."""
     hold_out: str | None = None
-    """Frames to hold out: every:8, last:5 or none."""
+    """Frames to hold out: every:8, train:5, last:5 or none."""
     threshold: float | None = None
     """Contrast threshold of both signs."""
     trust_pickle: bool = False
