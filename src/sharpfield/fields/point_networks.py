@@ -18,7 +18,6 @@ from torch import Tensor, nn
 
 from sharpfield.core.seed import generator
 from sharpfield.fields.neural_points import Attributes, NeuralPoints
-from sharpfield.ops.dense import apply_linear
 from sharpfield.ops.knn import first_near, neighbours
 from sharpfield.ops.leaky import LeakyLayers, leaky
 from sharpfield.ops.rows import compact, take_rows

@@ -7,7 +7,6 @@ learned descriptors; the few around a place on a ray tell its density and colour
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 

@@ -9,6 +9,7 @@ Source: Kingma and Ba, "Adam: a method for stochastic optimization" (ICLR 2015),
 Adam would go on moving rows that take no part along their momentum.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -54,6 +55,11 @@ class RowAdam(Adam):
         state["exp_avg"][rows] = mean
         state["exp_avg_sq"][rows] = square
         count = taken.view(-1, *[1] * (slope.ndim - 1))
-        mean = mean / (1 - first**count)
-        size = (square / (1 - second**count)).sqrt() + group["eps"]
+        mean = mean / _begun(first, count)
+        size = (square / _begun(second, count)).sqrt() + group["eps"]
         parameter.index_add_(0, rows, mean / size, alpha=-group["lr"])
+
+
+def _begun(decay: float, count: Tensor) -> Tensor:
+    """1 - decay^count: what an average that began at zero holds of what it should."""
+    return -torch.expm1(count * math.log(decay))
