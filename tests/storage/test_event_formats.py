@@ -3,6 +3,7 @@ import pytest
 
 from sharpfield.captures.event_cache import read_events
 from sharpfield.core.errors import OptionError
+from sharpfield.recordings.evt import open_evt
 from sharpfield.storage.event_formats import FORMATS, exporting_events
 from sharpfield.storage.event_layouts import open_events
 
@@ -11,6 +12,9 @@ def read_back(path):
     if path.suffix == ".csv":
         t_us, x, y, p = np.loadtxt(path, np.int64, delimiter=",", skiprows=1, ndmin=2).T
         return x, y, t_us, p
+    if path.suffix == ".raw":
+        events = open_evt(path).load()
+        return events.x, events.y, events.t_us, events.p
     own = {} if path.suffix == ".h5" else {"unit": "us", "size": (12, 10)}
     with open_events(path, **own) as file:
         events = read_events(file)

@@ -47,7 +47,7 @@ class Header:
     def number(self, *names: str) -> int | None:
         """The first of these fields that is a whole number."""
         for name in names:
-            if re.fullmatch(r"[0-9]{1,9}", self.fields.get(name, "")):
+            if re.fullmatch(r"-?[0-9]{1,18}", self.fields.get(name, "")):
                 return int(self.fields[name])
         return None
 

@@ -3,6 +3,7 @@
     .h5     our own, see `storage.event_writer`: it says its units and its sensor
     .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
     .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
+    .raw    Prophesee's EVT3, see `storage.evt_writer`
 
 Whatever the format, the file appears whole, at the end, or not at all.
 """
@@ -18,6 +19,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing
 from sharpfield.storage.arrays import write_arrays
 from sharpfield.storage.event_writer import writing_events
+from sharpfield.storage.evt_writer import writing_evt
 
 Append = Callable[[EventStream], None]
 """Takes events that come after all earlier ones."""
@@ -28,7 +30,7 @@ def exporting_events(path: Path, like: EventStream) -> Iterator[Append]:
     """What takes the events of a new file.
 
     Args:
-        path: Ends in .h5, .npz or .csv.
+        path: Ends in .h5, .npz, .csv or .raw.
         like: Any stream of the same sensor, it may be empty.
 
     Raises:
@@ -84,4 +86,10 @@ def _text(path: Path, like: EventStream) -> Iterator[Append]:
         yield append
 
 
-FORMATS = {".h5": _native, ".npz": _arrays, ".csv": _text}
+@contextmanager
+def _raw(path: Path, like: EventStream) -> Iterator[Append]:
+    with writing_evt(path, like) as writer:
+        yield writer.append
+
+
+FORMATS = {".h5": _native, ".npz": _arrays, ".csv": _text, ".raw": _raw}
