@@ -11,12 +11,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, Shaped, UInt8, UInt16
+from jaxtyping import Bool, Float64, Shaped, UInt8, UInt16
 
 from sharpfield.captures.mapped_images import mapped
 from sharpfield.captures.photos import Photos, photo_capture
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Note, Split
+from sharpfield.core.capture import Capture, Split
 from sharpfield.core.depth import MILLIMETRE, DepthMaps
 from sharpfield.core.errors import CaptureError
 
@@ -93,7 +93,7 @@ def rgbd_capture(
     photos = Photos(
         images=images,
         poses=frames.poses[kept],
-        names=[frames.names[i] for i in kept],
+        names=[frames.names[i] for i in kept.tolist()],
         camera=camera,
         encoding=encoding,
     )
@@ -177,9 +177,9 @@ def _sized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _dropped(names: Sequence[str], usable: Bool[np.ndarray, "n"]) -> dict[str, Note]:
-    gone: Int64[np.ndarray, g] = np.flatnonzero(~usable)
-    if not len(gone):
+def _dropped(names: Sequence[str], usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:
+    gone = np.flatnonzero(~usable).tolist()
+    if not gone:
         return {}
     named = ", ".join(names[i] for i in gone[:NAMED]) + (", ..." if len(gone) > NAMED else "")
     return {"dropped": f"{len(gone)} of {len(usable)} frames have no usable pose: {named}"}

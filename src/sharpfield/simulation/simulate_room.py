@@ -176,7 +176,7 @@ class _Probe:
 def _exposure(probe: _Probe, camera: Camera, timing: RoomTiming) -> Exposure:
     """All exposures; those of held-out frames, and of all if blur is as published, are instants."""
     middle = timing.middle_us()
-    learned = np.flatnonzero(~timing.held_out)
+    learned = np.flatnonzero(~timing.held_out).tolist()
 
     def travels(exposure_us: int) -> Float64[np.ndarray, "n"]:
         opens = middle - exposure_us // 2
