@@ -9,6 +9,7 @@ from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
 from sharpfield.cli.event_commands import events
 from sharpfield.cli.export_command import export
+from sharpfield.cli.ingest_command import ingest
 from sharpfield.cli.poses_command import poses
 from sharpfield.cli.recipe_commands import recipes
 from sharpfield.cli.run_commands import evaluate, render, train
@@ -18,6 +19,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "simulate": simulate,
     "footage": footage,
+    "ingest": ingest,
     "inspect": inspect,
     "deblur": deblur,
     "poses": poses,

@@ -1,0 +1,183 @@
+"""The command that makes a capture of what a camera has recorded."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from tyro.conf import Positional
+
+from sharpfield.cli.capture_commands import parse_size
+from sharpfield.core.errors import OptionError
+from sharpfield.preparation.ingest import Ingested, Tell
+from sharpfield.preparation.ingest import ingest as ingest_recordings
+from sharpfield.preparation.ingest_choices import Choices, Cleaning, Crop, Scene, Timing
+from sharpfield.preparation.ingest_lens import Optics
+from sharpfield.recordings.open import FORMATS, format_of, open_recording
+from sharpfield.recordings.recording import Recording
+
+FRAMES_ONLY = ("video", "pictures")
+"""Formats that hold no events."""
+
+Size = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
+Start = Annotated[float | None, tyro.conf.arg(name="from", metavar="MS")]
+End = Annotated[float | None, tyro.conf.arg(name="to", metavar="MS")]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What the files do not say of themselves."""
+
+    layout: str | None = None
+    """Format of the file of events; by default it is recognised. See docs/ingest.md."""
+    unit: str | None = None
+    """Of the times of events: ns, us, ms or s."""
+    size: Size = None
+    """Of the event sensor, in pixels."""
+    topic: str | None = None
+    """Which of several cameras, streams or topics."""
+    columns: str | None = None
+    """What the columns of a table of events are: xytp or txyp."""
+    frame_unit: str | None = None
+    """Of the times of pictures."""
+    per_second: float | None = None
+    """Frames taken per second, where nothing says when they were, or the video is slow motion."""
+    times: Path | None = None
+    """The file that says when pictures were taken, where there are several."""
+
+    def opened(self, path: Path) -> Recording:
+        """A recording, with those of the options that its format knows."""
+        name = format_of(path)
+        if name not in FRAMES_ONLY and self.layout is not None:
+            name = self.layout
+        if name not in FORMATS:
+            raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
+        given = {
+            "unit": self.frame_unit if name in FRAMES_ONLY else self.unit,
+            "size": None if self.size is None else parse_size(self.size),
+            "topic": self.topic,
+            "columns": self.columns,
+            "per_second": self.per_second,
+            "times": self.times,
+        }
+        taken = {option: given[option] for option in FORMATS[name].takes}
+        return open_recording(path, layout=name, **taken)
+
+    def expect_used(self, names: list[str]) -> None:
+        """Refuse options that none of the formats knows: they would have no effect.
+
+        Raises:
+            OptionError: There is one.
+        """
+        known = {option for name in names for option in FORMATS[name].takes}
+        events_only = all(name in FRAMES_ONLY for name in names)
+        for option in ("unit", "size", "topic", "columns", "per_second", "times"):
+            useless = option not in known or (option == "unit" and events_only)
+            if getattr(self, option) is not None and useless:
+                raise OptionError(
+                    f"--{option.replace('_', '-')} has no effect on these recordings",
+                    got=" and ".join(names),
+                    do="leave it out",
+                )
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part to keep, in ms from the first event."""
+
+    start_ms: Start = None
+    """Leave out what came before."""
+    end_ms: End = None
+    """Leave out what came after."""
+
+
+SOURCE, PART = Source(), Part()
+OPTICS, CLEANING, TIMING, SCENE = Optics(), Cleaning(), Timing(), Scene()
+
+
+def ingest(
+    recordings: Positional[tuple[Path, ...]],
+    out: Path,
+    source: Source = SOURCE,
+    part: Part = PART,
+    timing: Timing = TIMING,
+    optics: Optics = OPTICS,
+    cleaning: Cleaning = CLEANING,
+    scene: Scene = SCENE,
+) -> None:
+    """Make a capture of a camera's recording, or of two: events in one file, frames in another.
+
+    Interrupted, the same command goes on where it was.
+
+    Args:
+        recordings: Files or folders that a camera or a program has written.
+        out: Folder of the capture.
+        source: What the files do not say.
+        part: Which part to keep.
+        timing: When frames were exposed.
+        optics: Lenses.
+        cleaning: Events to leave out.
+        scene: Poses, depth, colour.
+    """
+    if len(recordings) not in (1, 2):
+        raise OptionError("give one recording, or two", got=len(recordings))
+    console = Console()
+    source.expect_used([source.layout or format_of(path) for path in recordings])
+    opened = tuple(source.opened(path) for path in recordings)
+    for recording in opened:
+        console.print(f"{recording.path} is {recording.layout}", highlight=False)
+    choices = Choices(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
+    with _telling(console) as tell:
+        made = ingest_recordings(opened, out, choices, tell)
+    for line in _story(made, out):
+        console.print(line, highlight=False)
+
+
+def _story(made: Ingested, out: Path) -> Iterator[str]:
+    """What became of the recording, line by line."""
+    lasts = (made.span_us[1] - made.span_us[0]) / 1e6
+    yield f"{made.frames:,} frames and {made.events:,} events over {lasts:.3f} s are in {out}"
+    for kind, count in made.left_out.items():
+        yield f"  left out: {count:,} {kind}"
+    if made.hot_pixels:
+        yield f"  hot pixels: {made.hot_pixels:,}, listed in the note `hot_pixels`"
+    if made.clock:
+        yield f"  {made.clock}"
+    if made.unknown:
+        yield f"  not known yet: {', '.join(made.unknown)}"
+    if "poses" in made.unknown:
+        yield f"next: sharpfield doctor {out}, then sharpfield poses {out}"
+
+
+@contextmanager
+def _telling(console: Console) -> Iterator[Tell]:
+    """Progress: a line for each thing that is being done."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    tasks: dict[str, TaskID] = {}
+    quiet = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+
+        def tell(doing: str, done: int, total: int | None) -> None:
+            if doing not in tasks:
+                tasks[doing] = progress.add_task(doing, total=total)
+            progress.update(tasks[doing], completed=done, total=total)
+
+        yield tell

@@ -1,0 +1,75 @@
+"""What can be chosen when a recording is ingested; the command line has an option for each."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from sharpfield.preparation.ingest_clock import Stamp
+from sharpfield.preparation.ingest_lens import Optics
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """Which events to leave out."""
+
+    hot: float = 10.0
+    """Silence pixels that report so many times as often as the pixels around them; 0 keeps all."""
+    lonely_ms: float = 0.0
+    """Leave out events that none of the eight pixels around joined within so long before; this
+    takes noise, and some of the signal. 0 keeps all."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Which part to keep, in ms from the first event."""
+
+    start_ms: float | None = None
+    end_ms: float | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When frames were exposed."""
+
+    exposure: str | None = None
+    """How long the shutter was open, where the recording does not say: 8ms, or 0.5 of the time
+    from one frame to the next. Without it such frames are taken for instants, free of blur."""
+    stamp: Stamp = "open"
+    """What the single time of such a frame is: its shutter's opening, the middle, its closing."""
+    clock: Literal["auto", "same", "triggers", "find"] = "auto"
+    """How the times of frames of a second recording come to the clock of the events: `same` if
+    both were on one clock, `triggers` if the frame camera drives a trigger of the other, `find` by
+    what both see. By default triggers if there are any, else find."""
+    trigger_channel: int | None = None
+    """The one that the frame camera drives, where there are several."""
+    offset_ms: float | None = None
+    """What to add to the times of the frames; nothing is searched for then."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known besides."""
+
+    poses: Path | None = None
+    """Where the camera was: TUM's format, or the trajectory.npz of a capture."""
+    near: float | None = None
+    """Nearest depth of the scene, in units of the poses."""
+    far: float | None = None
+    """Farthest."""
+    encoding: str | None = None
+    """How stored values of frames relate to light: linear, gamma2.2 or srgb. By default srgb for
+    videos and pictures, linear for raw colour, else gamma2.2."""
+    bayer: str | None = None
+    """Colour filter tile of the sensor, where the recording does not say: RGGB, GRBG, GBRG, BGGR;
+    or `none`."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Everything that can be chosen."""
+
+    optics: Optics = field(default_factory=Optics)
+    cleaning: Cleaning = field(default_factory=Cleaning)
+    crop: Crop = field(default_factory=Crop)
+    timing: Timing = field(default_factory=Timing)
+    scene: Scene = field(default_factory=Scene)
