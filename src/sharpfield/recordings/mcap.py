@@ -1,0 +1,142 @@
+"""MCAP files, which ROS 2 writes by default, read from the front: torn ones are read, too.
+
+A *record* is its kind, its length and its content. A *chunk* holds other records, perhaps
+compressed. A *schema* names a type, a *channel* ties a number to a topic and its schema. The
+summary at the end is used only to learn of all channels at once.
+
+Source: https://mcap.dev/spec.
+"""
+
+import io
+import struct
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.bag import Bag, Message, Topic, topic_of
+from sharpfield.recordings.blocks import head
+from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.unpacking import LIMIT, Damaged, unpacked
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
+FOOTER_SIZE = 9 + 20 + len(MAGIC)
+
+Channels = dict[int, tuple[str, Topic]]
+Record = tuple[int, bytes]
+
+
+def open_mcap(path: Path) -> Bag:
+    """Open a file.
+
+    Raises:
+        CaptureError: It is no MCAP.
+    """
+    if head(path, len(MAGIC)) != MAGIC:
+        raise CaptureError("the file is no MCAP", where=path)
+    channels = _summarised(path) or _channels(_records(path, len(MAGIC), Trouble()))
+
+    def messages(wanted: Collection[str], trouble: Trouble) -> Iterator[Message]:
+        numbers = {n: name for n, (name, _) in channels.items() if name in wanted}
+        for kind, content in _records(path, len(MAGIC), trouble):
+            if kind == MESSAGE and len(content) >= 22:
+                number, _, logged_ns = struct.unpack_from("<HIQ", content)
+                if number in numbers:
+                    yield Message(numbers[number], logged_ns, content[22:])
+
+    return Bag(path, "ROS2 MCAP", dict(channels.values()), messages)
+
+
+def _summarised(path: Path) -> Channels:
+    """Channels as the summary has them; none if there is no summary."""
+    length = path.stat().st_size
+    if length < len(MAGIC) + FOOTER_SIZE:
+        return {}
+    with path.open("rb") as file:
+        file.seek(length - FOOTER_SIZE)
+        kind, _, start = struct.unpack("<BQQ", file.read(17))
+    if kind != FOOTER or not len(MAGIC) < start < length:
+        return {}
+    return _channels(_records(path, start, Trouble()))
+
+
+def _channels(records: Iterator[Record]) -> Channels:
+    schemas: dict[int, str] = {}
+    found: Channels = {}
+    for kind, content in records:
+        try:
+            if kind == SCHEMA:
+                number, content = _number(content, "H")
+                schemas[number] = _text(content)[0]
+            elif kind == CHANNEL:
+                number, content = _number(content, "H")
+                schema, content = _number(content, "H")
+                name, content = _text(content)
+                encoding, _ = _text(content)
+                if encoding in ("cdr", "ros1"):
+                    found[number] = name, topic_of(schemas.get(schema, ""), cdr=encoding == "cdr")
+        except Damaged:
+            continue
+    return found
+
+
+def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
+    """Records outside and inside of chunks, up to the end of the data or of the summary."""
+    length = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(begin)
+        try:
+            for kind, content in _plain(file, length):
+                if kind in (DATA_END, FOOTER):
+                    return
+                if kind != CHUNK:
+                    yield kind, content
+                    continue
+                try:
+                    data = _chunk(content)
+                    yield from _plain(io.BytesIO(data), len(data))
+                except Damaged:
+                    trouble.note("damaged chunks")
+            trouble.note("torn ends of the file")
+        except Damaged:
+            trouble.note("torn ends of the file")
+
+
+def _plain(file: BinaryIO, end: int) -> Iterator[Record]:
+    while start := file.read(9):
+        if len(start) < 9:
+            raise Damaged("a torn record")
+        kind, size = struct.unpack("<BQ", start)
+        if size > end - file.tell():
+            raise Damaged("a torn record")
+        if kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
+            if size > LIMIT:
+                raise Damaged(f"a record of {size} bytes")
+            yield kind, file.read(size)
+        else:
+            file.seek(size, io.SEEK_CUR)
+            yield kind, b""
+
+
+def _chunk(content: bytes) -> bytes:
+    """Its start and end, unpacked size and checksum are not needed."""
+    packing, content = _text(content[28:])
+    size, content = _number(content, "Q")
+    if size > len(content):
+        raise Damaged("a torn chunk")
+    return unpacked(content[:size], packing or "none")
+
+
+def _number(data: bytes, kind: str) -> tuple[int, bytes]:
+    size = struct.calcsize(f"<{kind}")
+    if len(data) < size:
+        raise Damaged("a torn record")
+    return struct.unpack_from(f"<{kind}", data)[0], data[size:]
+
+
+def _text(data: bytes) -> tuple[str, bytes]:
+    length, data = _number(data, "I")
+    if length > len(data):
+        raise Damaged("a torn text")
+    return data[:length].decode("utf-8", "replace"), data[length:]
