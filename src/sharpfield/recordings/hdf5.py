@@ -16,7 +16,7 @@ Source: Gehrig et al., *DSEC* (RA-L 2021); Klenk et al., *TUM-VIE* (IROS 2021); 
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,11 +28,15 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.columns import recording_of
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.storage.event_columns import known_unit, whole_us
-from sharpfield.storage.event_file import EventFile
-from sharpfield.storage.event_layouts import compression_plugin, open_events
+from sharpfield.storage.event_file import UNREADABLE, EventFile
+from sharpfield.storage.event_layouts import compression_plugin, expect_filled, open_events
 
 CAMERA = "*"
 """Stands in a path for the name of one of several cameras."""
+
+
+DAMAGED = (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError)
+"""What h5py may end in where the structure of a file is damaged: a type that does not exist ..."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,13 @@ def open_hdf5(
     Raises:
         CaptureError: It holds no events in a known layout, or does not say its unit or size.
     """
+    with _whole(path):
+        return _recording(path, unit, size, topic)
+
+
+def _recording(
+    path: Path, unit: str | None, size: tuple[int, int] | None, topic: str | None
+) -> Recording:
     with _opened(path) as file:
         found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
     if not found:
@@ -126,7 +137,7 @@ def open_hdf5(
     read = dialect.frames
 
     def frames() -> Iterator[Frame]:
-        with _opened(path) as file:
+        with _whole(path), _opened(path) as file:
             yield from read(file, camera)
 
     return replace(made, frames=frames)
@@ -153,8 +164,11 @@ def _event_file(
         file = resources.enter_context(_opened(path))
         held = file[dialect.at(camera)]
         if dialect.table:
+            expect_filled(held, f"{path}, {held.name}")
             order = dialect.columns[0]
-            columns = {name: TableColumn(held, order.index(name)) for name in "xytp"}
+            columns: dict[str, Any] = {
+                name: TableColumn(held, order.index(name)) for name in "xytp"
+            }
         else:
             columns = {
                 name: _column(held, dialect.columns[i], path) for i, name in enumerate("xytp")
@@ -179,12 +193,28 @@ def _event_file(
 def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
     column = group[name]
     if isinstance(column, h5py.Dataset) and column.ndim == 1 and column.dtype.kind in "iufb":
+        expect_filled(column, f"{path}, {column.name}")
         return column
     raise CaptureError(
         "an event column must be a one-dimensional array of numbers",
         where=f"{path}, {group.name}/{name}",
         got=column,
     )
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """Whatever the HDF5 library stumbles over within is damage of the file.
+
+    Raises:
+        CaptureError: It stumbled.
+    """
+    try:
+        yield
+    except DAMAGED as error:
+        raise CaptureError(
+            "the file is damaged", where=path, got=error, do="copy or convert it again"
+        ) from None
 
 
 def _opened(path: Path) -> h5py.File:

@@ -14,6 +14,9 @@ from sharpfield.core.errors import CaptureError, OptionError
 UNITS = {"ns": 1e-3, "us": 1.0, "ms": 1e3, "s": 1e6}
 """Units of time, in us."""
 
+LATEST_US = 2.0**62
+"""A time that no clock shows, in 146,000 years."""
+
 Stored = Shaped[np.ndarray, "n"]
 """A column as the file has it: integers, floats or booleans."""
 
@@ -36,13 +39,14 @@ def whole_us(stored: Stored, unit: str, where: object) -> Int64[np.ndarray, "n"]
         CaptureError: A time is not finite.
     """
     if np.issubdtype(stored.dtype, np.floating):
-        wrong = np.flatnonzero(~np.isfinite(stored))
+        wrong = np.flatnonzero(~(np.abs(stored) < LATEST_US / UNITS[unit]))
         if len(wrong):
+            finite = np.isfinite(stored[wrong[0]])
             raise CaptureError(
-                "a time is not a finite number",
+                "a time is beyond all dates" if finite else "a time is not a finite number",
                 where=f"{where}, entry {wrong[0]}",
                 got=stored[wrong[0]],
-                do="drop these entries when converting",
+                do="check the unit" if finite else "drop these entries when converting",
             )
         return np.floor(stored.astype(np.float64) * UNITS[unit] + 0.5).astype(np.int64)
     ticks = stored.astype(np.int64)
@@ -144,8 +148,8 @@ class ZippedColumn:
         """Number of entries."""
         return self.shape[0]
 
-    def __getitem__(self, part: slice) -> Stored:
-        """Entries `part.start` to `part.stop`."""
+    def __getitem__(self, part: slice) -> Shaped[np.ndarray, "n ..."]:
+        """Entries, or rows, `part.start` to `part.stop`."""
         first, last, _ = part.indices(len(self))
         self._file.seek(self._start + first * self._row)
         data = self._file.read(max(last - first, 0) * self._row)

@@ -23,7 +23,7 @@ SEARCHED = 2**16
 """Times unpacked at once when looking for one: an HDF5 chunk or so."""
 
 
-UNREADABLE = (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
 """What reading a part of a damaged file may end in."""
 
 

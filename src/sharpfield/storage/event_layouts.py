@@ -42,8 +42,8 @@ BLOSC, PROPHESEE_ECF = 32001, 0x8ECF
 """Numbers of HDF5 compression filters that need a plugin."""
 
 
-UNREADABLE_NPZ = (*UNREADABLE, KeyError, NotImplementedError, RuntimeError)
-"""What opening a damaged archive may end in: also no such member, unknown packing, a password."""
+UNREADABLE_NPZ = (*UNREADABLE, KeyError)
+"""What opening a damaged archive may end in: also in a member that is not there."""
 
 
 def open_events(
@@ -202,7 +202,29 @@ def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
             "an event column must be a one-dimensional array of numbers", where=where, got=column
         )
     _expect_filters(column, where)
+    expect_filled(column, where)
     return column
+
+
+def expect_filled(column: h5py.Dataset, where: str) -> None:
+    """Make sure that a data set is as long as it says: HDF5 makes zeros of what is not there.
+
+    Raises:
+        CaptureError: It is shorter.
+    """
+    if column.chunks is None:
+        row = column.dtype.itemsize * int(np.prod(column.shape[1:]))
+        filled = column.id.get_storage_size() // max(row, 1)
+    else:
+        across = [-(-n // k) for n, k in zip(column.shape[1:], column.chunks[1:], strict=True)]
+        filled = column.id.get_num_chunks() // max(int(np.prod(across)), 1) * column.chunks[0]
+    if filled < column.shape[0]:
+        raise CaptureError(
+            "event columns are shorter than they say",
+            where=where,
+            got=f"{filled} of {column.shape[0]} rows",
+            do="the file may be truncated: copy or convert it again",
+        )
 
 
 def _expect_filters(column: h5py.Dataset, where: str) -> None:
