@@ -7,6 +7,7 @@ anywhere. Times are those of the camera's clock, which began before the recordin
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
@@ -45,7 +46,7 @@ class Encoding:
     name: str
     word: str
     """Type of its words, as numpy names it."""
-    decode: Callable[..., tuple[int, int, int]]
+    decode: Callable[..., Any]
     swapped: bool = False
     """Whether the two halves of a word come the other way round."""
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, no_type_check
+from typing import Any, BinaryIO, no_type_check
 
 import numpy as np
 from jaxtyping import Int64
@@ -40,7 +40,7 @@ PAYS = 5
 HIGH, LOW, ROW = range(3)
 """What the last words said, -1 before the first."""
 
-Encode = Callable[..., tuple[int, int]]
+Encode = Callable[..., Any]
 
 
 @dataclass(frozen=True)
