@@ -8,6 +8,7 @@ How messages are kept is the matter of `recordings.ros1_bag`, `recordings.mcap` 
 Source: the ROS wiki, "msg"; OMG, *DDS-XTypes*, 7.4 (plain CDR).
 """
 
+import io
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ from sharpfield.recordings.unpacking import Damaged
 
 TEXT = 2**16
 """Bytes of the longest text in a message."""
+
+File = io.BufferedReader | io.BytesIO
+"""Of a disk, or of a part that was unpacked."""
 
 
 class Topic(NamedTuple):

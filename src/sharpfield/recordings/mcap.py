@@ -11,10 +11,9 @@ import io
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bag import Bag, Message, Topic, topic_of
+from sharpfield.recordings.bag import Bag, File, Message, Topic, topic_of
 from sharpfield.recordings.blocks import head
 from sharpfield.recordings.recording import Trouble
 from sharpfield.recordings.unpacking import LIMIT, Damaged, unpacked
@@ -103,12 +102,15 @@ def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
             trouble.note("torn ends of the file")
 
 
-def _plain(file: BinaryIO, end: int) -> Iterator[Record]:
+def _plain(file: File, end: int) -> Iterator[Record]:
     while start := file.read(9):
         if len(start) < 9:
             raise Damaged("a torn record")
         kind, size = struct.unpack("<BQ", start)
         if size > end - file.tell():
+            if kind == CHUNK:
+                # Of a recording that broke off, its last chunk may be read in part.
+                yield kind, file.read(LIMIT)
             raise Damaged("a torn record")
         if kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
             if size > LIMIT:
@@ -123,8 +125,6 @@ def _chunk(content: bytes) -> bytes:
     """Its start and end, unpacked size and checksum are not needed."""
     packing, content = _text(content[28:])
     size, content = _number(content, "Q")
-    if size > len(content):
-        raise Damaged("a torn chunk")
     return unpacked(content[:size], packing or "none")
 
 

@@ -11,10 +11,10 @@ import io
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bag import Bag, Message, Topic, topic_of
+from sharpfield.recordings.bag import Bag, File, Message, Topic, topic_of
 from sharpfield.recordings.blocks import head
 from sharpfield.recordings.recording import Trouble
 from sharpfield.recordings.unpacking import LIMIT, Damaged, unpacked
@@ -91,7 +91,7 @@ def _scanned(path: Path) -> Connections:
     return found
 
 
-def _connection(file: BinaryIO, record: _Record) -> tuple[int, tuple[str, Topic]]:
+def _connection(file: File, record: _Record) -> tuple[int, tuple[str, Topic]]:
     file.seek(record.place)
     fields = _fields(file.read(min(record.size, LONGEST)))
     name = record.fields.get(b"topic", b"").decode("utf-8", "replace")
@@ -108,7 +108,7 @@ def _messages(path: Path, topics: dict[int, str], trouble: Trouble) -> Iterator[
             yield Message(name, logged_ns, file.read(record.size))
 
 
-def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[BinaryIO, _Record]]:
+def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[File, _Record]]:
     """Records outside and inside of chunks, with what to read their data from."""
     length = path.stat().st_size
     with path.open("rb") as file:
@@ -127,7 +127,7 @@ def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[BinaryIO, _Reco
             trouble.note("torn ends of the file")
 
 
-def _chunk(file: BinaryIO, record: _Record) -> io.BytesIO:
+def _chunk(file: File, record: _Record) -> io.BytesIO:
     if record.size > LIMIT:
         raise Damaged(f"a chunk of {record.size} bytes")
     file.seek(record.place)
@@ -135,7 +135,7 @@ def _chunk(file: BinaryIO, record: _Record) -> io.BytesIO:
     return io.BytesIO(unpacked(file.read(record.size), packing))
 
 
-def _records(file: BinaryIO, begin: int, end: int) -> Iterator[_Record]:
+def _records(file: File, begin: int, end: int) -> Iterator[_Record]:
     """Consecutive records; their data are not read."""
     place = begin
     while place < end:
