@@ -74,9 +74,9 @@ def check(open_function: Open, path: Path, *, case: Case | None = None) -> str:
         AssertionError: Events are unsound, or more than the bytes can hold, or it took too long.
     """
     per_byte, seconds = (case.most_per_byte, case.seconds) if case else (12.0, 2.0)
-    begin = time.perf_counter()
+    begin = time.process_time()  # others may be using the processor, too
     outcome = _read(open_function, path, most=int(per_byte * path.stat().st_size) + 1)
-    took = time.perf_counter() - begin
+    took = time.process_time() - begin
     assert took < seconds, f"took {took:.1f} s"
     return outcome
 
@@ -90,7 +90,9 @@ def campaign(name: str, *, files: int, folder: Path, seed: int = 0) -> Counter[s
     original = case.original()
     sound = folder / f"sound-{name}{case.suffix}"
     sound.write_bytes(original)
-    assert check(case.open, sound) == "whole", f"the sound file of {name} is not sound"
+    # Reading for the first time may take long: loops are compiled.
+    whole = _read(case.open, sound, most=int(case.most_per_byte * len(original)) + 1)
+    assert whole == "whole", f"the sound file of {name} is not sound"
     outcomes: Counter[str] = Counter()
     for number in range(seed, seed + files):
         path = folder / f"damaged-{name}{case.suffix}"
