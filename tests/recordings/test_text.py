@@ -152,7 +152,7 @@ def test_blocks_may_be_cut_anywhere(
 
 @pytest.mark.parametrize("name", ["text", "text-zip"])
 def test_damaged_files_end_cleanly(name: str, tmp_path: Path) -> None:
-    assert fuzz.campaign(name, files=200, folder=tmp_path)["partial"] > 3
+    assert fuzz.campaign(name, files=120, folder=tmp_path)["partial"] > 1
 
 
 @pytest.mark.parametrize(

@@ -167,6 +167,7 @@ class _Decoder:
             self._take(block)
             yield from self._decode(last=False)
         yield from self._decode(last=True)
+        assert not len(self._words), "a decoder leaves nothing where nothing follows"
         self._trouble.note("torn words", int(len(self._odd) > 0))
         if self._untimed and not self._state[STARTED]:
             raise CaptureError(
@@ -199,7 +200,7 @@ class _Decoder:
             self._tell(count)
             if room.end + ROOM > CHUNK:
                 yield room.taken(last=False)
-            elif found < EDGES:
+            elif not used or not len(self._words):
                 return
 
     def _tell(self, count: int) -> None:
