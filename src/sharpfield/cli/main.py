@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 
 import tyro
 
+from sharpfield.cli.calibrate_command import calibrate
 from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
 from sharpfield.cli.event_commands import events
@@ -23,6 +24,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "inspect": inspect,
     "deblur": deblur,
     "poses": poses,
+    "calibrate": calibrate,
     "train": train,
     "evaluate": evaluate,
     "render": render,

@@ -71,8 +71,10 @@ def poses(
     _write_json(out / REPORT, about)
     write_page(out / PAGE, original, found, about)
     console = Console()
-    console.print(as_text(about), highlight=False)
-    console.print(f"The capture with poses is in {out}; open {out / PAGE}", highlight=False)
+    console.print(as_text(about), highlight=False, soft_wrap=True)
+    console.print(
+        f"The capture with poses is in {out}; open {out / PAGE}", highlight=False, soft_wrap=True
+    )
 
 
 def _attach(
