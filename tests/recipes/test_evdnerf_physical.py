@@ -18,7 +18,8 @@ SMALL = EvDNeRFPhysical(
     steps=40,
     decay=40,
     pixels=32,
-    scene=MovingOptions(size=SpaceTimeSize(still=12, moving=8, moments=4), steps=16),
+    frames=20.0,
+    scene=MovingOptions(size=SpaceTimeSize(still=12, moving=8, moments=4), steps=16, empty=0.1),
     windows=WindowOptions(spans=32, counted=32),
 )
 

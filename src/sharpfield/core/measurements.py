@@ -78,5 +78,15 @@ class Instants(Struct):
     """Width and height of the part."""
 
 
-Batch = dict[str, Pixels | EventPairs | Instants]
+@dataclass(frozen=True)
+class Depths(Struct):
+    """What a depth camera measured of the pixels of a look."""
+
+    value: Float[Tensor, "*b"]
+    """Along the camera's axis, in units of the scene; 0 where nothing was measured."""
+    instant: Int64[Tensor, "*b"]
+    """At which of the instants of the look it was measured."""
+
+
+Batch = dict[str, Pixels | EventPairs | Instants | Depths]
 """What a recipe draws for a step, by name."""

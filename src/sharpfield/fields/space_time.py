@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 COARSER = 4
 """Each grid has so many times fewer cells along an axis than the next."""
@@ -66,6 +67,20 @@ class SpaceTimeVoxels(nn.Module):
         self.moving[level].register_hook(
             lambda gradient: gradient * self.get_buffer(f"free_{level}")
         )
+
+    def raw_density(self, points: Float[Tensor, "n 3"], time: float) -> Float[Tensor, "n"]:
+        """Raw density at points of the box, all at one time from 0 to 1."""
+        grids = [*self.still]
+        for grid in self.moving:
+            at = time * (len(grid) - 1)
+            first = min(int(at), len(grid) - 2)
+            grids.append(grid[first].lerp(grid[first + 1], at - first))
+        place = points[None, None, None]
+        found = [
+            functional.grid_sample(grid[None, None, ..., 0], place, align_corners=True)
+            for grid in grids
+        ]
+        return torch.stack(found).sum(0)[0, 0, 0, 0]
 
     def background(self) -> Float[Tensor, "3"]:
         """Light from behind the box, 0...1: the same from everywhere and at all times."""

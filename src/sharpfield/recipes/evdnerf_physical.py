@@ -86,7 +86,7 @@ class EvDNeRFPhysical:
     """Pixels of frames drawn per step, if there are frames."""
     instants: int = 3
     """Instants of an exposure that lasts."""
-    frames: float = 20.0
+    frames: float = 500.0
     """Weight of the frames."""
 
     def lasting(self, steps: int) -> "EvDNeRFPhysical":
@@ -147,7 +147,7 @@ class Model(nn.Module):
         return batch
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Errors of spans, of windows and of frames, and how rough the scene is."""
+        """Errors of spans, of windows and of frames; how rough the scene is, and how foggy."""
         assert isinstance(spans := batch["spans"], EventPairs)
         assert isinstance(windows := batch["windows"], EventPairs)
         both = EventPairs.cat([spans, windows])
@@ -164,6 +164,7 @@ class Model(nn.Module):
                 change[counted], measured[counted], usual[counted], pull=self.recipe.windows.pull
             ),
             "rough": self.scene.roughness(step),
+            "fog": self.scene.fog(step),
         }
         if isinstance(self.thresholds, LearnedThresholds):
             terms["thresholds"] = 1e-2 * self.thresholds.prior()

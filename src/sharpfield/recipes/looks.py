@@ -17,13 +17,15 @@ from torch import Tensor
 from sharpfield.captures import event_index
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
+from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
 from sharpfield.core.seed import number, numpy_generator
 from sharpfield.formation.event_counts import counts_between
 from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.event_phase import phase_at
 from sharpfield.formation.sharp_instants import Belief, SharpInstants
 from sharpfield.ops.permutation import shuffled
+from sharpfield.recipes.frame_weights import frame_weights
+from sharpfield.recipes.measured_depth import MeasuredDepth
 
 ROUNDED = 0.5
 """Events that a count may be off by at an end where the phase of the pixel is unknown."""
@@ -46,6 +48,8 @@ class LookOptions:
     """Views of an exposure."""
     early: float = 0.6
     """Part of the schedule that looks at single instants, if events can make sharp pictures."""
+    still: float = 0.0
+    """Part of the schedule that takes frames as if they were sharp: a view instead of several."""
     sharp: float = 0.2
     """Weight of the sharp pictures from events in late steps; in early ones it is 1. 0 leaves them
     out altogether."""
@@ -55,6 +59,11 @@ class LookOptions:
     """Least length of a window that begins or ends outside an exposure."""
     longest_us: int = 50_000
     """Most length of a stretch of events."""
+    depth: float = 0.0
+    """Weight of what a depth camera measured, in late steps."""
+    quality: Literal["even", "auto", "pictures", "events"] = "even"
+    """Which frames are looked at more often: none; those that events, or else pictures, say are
+    sharp; those that look sharp; those with few events during the exposure."""
     part: int = 0
     """Side of the square part of the image that a step looks at, in pixels; 0 takes the image."""
 
@@ -101,6 +110,11 @@ class Looks:
         known = capture.notes.get("motion") != "unknown"
         if self.motion is not None and frames is not None and options.sharp > 0 and known:
             self.sharp = SharpInstants(capture, self.motion, self.index)
+        self.depth = self.weights = None
+        if options.depth > 0 and capture.depth is not None:
+            self.depth = MeasuredDepth(capture.depth, capture.camera)
+        if options.quality != "even" and frames is not None:
+            self.weights = frame_weights(capture, options.quality)
 
     def instant(self, step: int, belief: Belief) -> Batch:
         """A single view of a sharp picture, anywhere between the first and the last exposure."""
@@ -113,13 +127,14 @@ class Looks:
             "sharp": self._sharp(times, frame, part, belief),
         }
 
-    def exposure(self, step: int, *, events: bool, belief: Belief) -> Batch:
-        """Views of one exposure, and with events of an instant beside it."""
+    def exposure(self, step: int, *, events: bool, belief: Belief, still: bool = False) -> Batch:
+        """Views of one exposure, or only its middle; and with events of an instant beside it."""
         random = numpy_generator(self.seed, step, "look")
         frames, part = self.capture.needed_frames, self._part(random)
         frame = self._frame(step)
         opens, closes = frames.exposure.window(frame)
-        count = self.options.instants if self.options.blur == "motion" and opens < closes else 1
+        moved = self.options.blur == "motion" and opens < closes and not still
+        count = self.options.instants if moved else 1
         place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
         times = np.rint(opens + (closes - opens) * place).astype(np.int64)
         weight = np.full(count, 1 / count)
@@ -135,6 +150,9 @@ class Looks:
             batch["frames"] = replace(batch["frames"], value=self._as_sampled(sharp.value, weight))
         if windows:
             batch["events"] = self._windows(times, part)
+        if self.depth is not None:
+            middle = np.abs(times - (opens + closes) / 2) + (weight == 0) * (closes - opens + 1)
+            batch["depth"] = self._depth(frame, int(np.argmin(middle)), part)
         return batch
 
     def _as_sampled(
@@ -169,8 +187,11 @@ class Looks:
         }
 
     def _frame(self, step: int) -> int:
-        """Every frame once, in a new order each time."""
+        """Every frame once, in a new order each time; or drawn by quality."""
         train = self.capture.split.train
+        if self.weights is not None:
+            chance = numpy_generator(self.seed, step, "frames").random()
+            return int(train[np.searchsorted(np.cumsum(self.weights), chance * self.weights.sum())])
         epoch, place = divmod(step, len(train))
         drawn = shuffled(
             np.array([place]), len(train), seed=number(self.seed, 0, "frames"), epoch=epoch
@@ -225,6 +246,12 @@ class Looks:
         return self._pixels(
             (image.to(torch.float32) / frames.white)[None], frame, (opens, closes), part
         )
+
+    def _depth(self, frame: int, instant: int, part: Part) -> Depths:
+        """What was measured `[1, h, w]`, and at which of the instants."""
+        assert self.depth is not None
+        depth = part.of(torch.from_numpy(self.depth.at(frame)))
+        return Depths(depth[None], torch.full((), instant).expand(1, *depth.shape))
 
     def _sharp(self, times: Times, frame: int, part: Part, belief: Belief) -> Pixels:
         """Sharp pictures `[1, h, w, k]` at some instants."""

@@ -8,6 +8,7 @@ from typing import cast
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.radiance import Radiance
@@ -17,8 +18,15 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
 from sharpfield.geometry.centred import centred
 from sharpfield.ops.event_index import EventIndex
+from sharpfield.ops.voxel_march import THIN
 from sharpfield.recipes.swept import swept
 from sharpfield.rendering.march_through_time import SpaceTime, ThroughBox
+
+FOG_POINTS = 2048
+"""Points that are asked for fog in each step."""
+
+DENSE = 10.0
+"""Steepness of the logarithm: a tenth of an e-fold in a step is dense."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +40,9 @@ class MovingOptions:
     """First raw density of what stands still: nearly empty, as events do not say what is there."""
     hull: bool = True
     """Voxels move only where every camera that stands still saw events."""
-    smooth: float = 1e-3
+    empty: float = 3.0
+    """Weight of how dense the box is: what nothing speaks for stays empty."""
+    smooth: float = 0.1
     """Weight of the total variation in space of what moves."""
     steady: float = 1e-3
     """Weight of its change from moment to moment."""
@@ -79,6 +89,17 @@ class MovingScene(nn.Module):
         across = [part.diff(dim=axis).square().mean() for axis in (1, 2, 3)]
         changes = part.diff(dim=0).square().mean()
         return self.options.smooth * torch.stack(across).sum() + self.options.steady * changes
+
+    def fog(self, step: int) -> Tensor:
+        """How dense the box is at random points, at one random moment.
+
+        The logarithm lets surfaces be as dense as they like (Plenoxels, CVPR 2022).
+        """
+        random = generator(self.seed, step, "fog")
+        points = 2 * torch.rand(FOG_POINTS, 3, generator=random) - 1
+        time = float(torch.rand((), generator=random))
+        raw = self.field.raw_density(points.to(self.device), time)
+        return self.options.empty * torch.log1p(DENSE * functional.softplus(raw + THIN)).mean()
 
     def groups(self, rate: Schedule) -> list[Group]:
         """Voxels and background."""

@@ -171,7 +171,7 @@ def splat_standard(recipe: Splat) -> Splat:
 
 
 Change = Callable[[Any], Any]
-SPLATS = ("splat", "edi-splat", "blur-splat", "event-splat", "ev-splat")
+SPLATS = ("splat", "edi-splat", "blur-splat", "event-splat", "ev-splat", "room-splat")
 
 REFINED_KNOTS = 48
 """Knots of a refined trajectory."""

@@ -18,7 +18,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.growth import Growth
-from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
+from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
@@ -28,6 +28,7 @@ from sharpfield.formation.mix import mix
 from sharpfield.formation.tone import tone_of
 from sharpfield.geometry.normalise import normalised
 from sharpfield.recipes.looks import LookOptions, Looks
+from sharpfield.recipes.measured_depth import depth_error
 from sharpfield.recipes.splat_scene import GaussianOptions, SplatScene
 from sharpfield.recipes.splat_start import starting_gaussians
 from sharpfield.recipes.unknowns import (
@@ -95,7 +96,12 @@ class SplatModel(nn.Module):
             recipe.gaussians,
             self.capture,
             starting_gaussians(
-                recipe.gaussians, self.capture, self.unknowns.guess, self.tone, seed
+                recipe.gaussians,
+                self.capture,
+                self.unknowns.guess,
+                self.tone,
+                seed,
+                weights=self.looks.weights,
             ),
             self.tone,
             steps=recipe.steps,
@@ -103,11 +109,13 @@ class SplatModel(nn.Module):
         )
         early = self.options.early if self.looks.sharp is not None else 0.0
         self.late_from = int(early * recipe.steps)
+        self.still_until = int(self.options.still * recipe.steps)
 
     @property
     def heaviest_step(self) -> int:
-        """The first late step."""
-        return min(self.late_from, max(self.recipe.steps - 1, 0))
+        """The first step that looks at several views."""
+        several = max(self.late_from, self.still_until)
+        return min(several, max(self.recipe.steps - 1, 0))
 
     def draw(self, step: int) -> Batch:
         """One instant in early steps; in late ones an exposure, or a stretch of events."""
@@ -117,7 +125,8 @@ class SplatModel(nn.Module):
         elif self.capture.frames is None:
             batch = self.looks.stretch(step)
         elif self.unknowns.offset_steps is None or self.looks.motion is None:
-            batch = self.looks.exposure(step, events=True, belief=belief)
+            still = step < self.still_until
+            batch = self.looks.exposure(step, events=not still, belief=belief, still=still)
         # Views of the frames' instants cannot tell when events really happened.
         elif step % 2:
             batch = self.looks.stretch(step)
@@ -142,6 +151,9 @@ class SplatModel(nn.Module):
             weight = 1.0 if step < self.late_from else self.options.sharp
             stored = self.tone.encode(self._exposed(light.rgb, sharp[..., 0]))
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
+        if isinstance(depth := batch.get("depth"), Depths):
+            drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
+            terms["depth"] = self.options.depth * depth_error(drawn, depth.value)
         if isinstance(events, EventPairs):
             unknowns = self.unknowns
             change = changes(light, events, unknowns.response)

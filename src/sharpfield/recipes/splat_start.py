@@ -2,12 +2,14 @@
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import generator
 from sharpfield.fields import Gaussians
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import Tone
+from sharpfield.recipes.measured_depth import points_on_surfaces
 from sharpfield.recipes.pictures import Pictures, sharp_pictures
 from sharpfield.recipes.splat_scene import GaussianOptions, budget_of
 from sharpfield.recipes.start_points import starting_points
@@ -25,6 +27,8 @@ def starting_gaussians(
     thresholds: tuple[float, float],
     tone: Tone,
     seed: int,
+    *,
+    weights: Float[np.ndarray, "n"] | None = None,
 ) -> Gaussians:
     """Small round Gaussians near the surfaces, as well as can be told.
 
@@ -34,19 +38,20 @@ def starting_gaussians(
         thresholds: Of the events, to darker and to brighter.
         tone: Gaussians hold stored values.
         seed: Of the run.
+        weights: Of the frames to learn from, for their quality.
     """
     made = generator(seed, 0, "start")
-    if capture.frames is None:
-        pictures = _grey(capture)
+    count = max(int(options.start * budget_of(options, capture)), 1)
+    if capture.frames is not None and capture.depth is not None:
+        start = points_on_surfaces(capture, tone, count, made, weights=weights, size=options.size)
     else:
-        pictures = sharp_pictures(capture, FixedThresholds(*thresholds))
-    start = starting_points(
-        pictures,
-        max(int(options.start * budget_of(options, capture)), 1),
-        made,
-        known=_known(capture),
-        size=options.size,
-    )
+        pictures = (
+            _grey(capture)
+            if capture.frames is None
+            else sharp_pictures(capture, FixedThresholds(*thresholds))
+        )
+        known = _known(capture)
+        start = starting_points(pictures, count, made, known=known, size=options.size)
     return Gaussians.start(
         torch.from_numpy(start.points),
         tone.encode(torch.from_numpy(start.colours)),
