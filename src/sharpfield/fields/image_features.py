@@ -8,11 +8,8 @@ into the place's own feature.
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.1; sizes from the released code.
 """
 
-from collections.abc import Sequence
-from typing import Literal
-
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.seed import generator
@@ -23,9 +20,6 @@ MAPS = (6, 12, 24)
 
 MERGED = 1e-6
 """Added to the sum of weights, so that places no source shows get zero."""
-
-Fetch = Literal["nearest", "bilinear"]
-"""Read the pixel that holds a place, as published, or between pixels."""
 
 
 class FeatureExtractor(nn.Module):
@@ -61,32 +55,6 @@ class FeatureExtractor(nn.Module):
                 image = leaky(one(image))
             levels.append(image.movedim(1, -1).contiguous())
         return levels
-
-
-def look_up(
-    levels: Sequence[Float[Tensor, "n _h _w _f"]],
-    source: Int64[Tensor, "*b"],
-    xy: Float[Tensor, "*b 2"],
-    *,
-    fetch: Fetch = "nearest",
-) -> Float[Tensor, "*b f"]:
-    """What all levels of some sources hold at pixels, side by side.
-
-    Equal to enlarging every map to the size of the picture (bilinearly) and reading it there, but
-    the enlarged maps never exist.
-
-    Args:
-        levels: Of all sources.
-        source: Which of them each pixel belongs to.
-        xy: In pixels, centres at +0.5; clamped to the picture.
-        fetch: Whether to read whole pixels.
-    """
-    height, width = levels[0].shape[1:3]
-    flat = xy.reshape(-1, 2)
-    if fetch == "nearest":
-        flat = flat.floor() + 0.5
-    found = [_bilinear(level, source.flatten(), flat, (height, width)) for level in levels]
-    return torch.cat(found, -1).view(*source.shape, -1)
 
 
 class Merging(nn.Module):
@@ -150,36 +118,3 @@ class Mixing(nn.Module):
         """The feature with what pictures know of it."""
         first, others = feature[:, : self.looked], feature[:, self.looked :]
         return torch.cat([first + self.network(first, merged.to(first.dtype)), others], -1)
-
-
-def _bilinear(
-    level: Float[Tensor, "n h w f"],
-    source: Int64[Tensor, "m"],
-    xy: Float[Tensor, "m 2"],
-    size: tuple[int, int],
-) -> Float[Tensor, "m f"]:
-    """One level at pixels of the picture, whose height and width are `size`."""
-    height, width = level.shape[1:3]
-    rows = level.reshape(-1, level.shape[-1])
-    if (height, width) == size:
-        place = xy - 0.5
-    else:
-        place = xy * xy.new_tensor([width / size[1], height / size[0]]) - 0.5
-    place = torch.minimum(place.clamp_min(0), place.new_tensor([width - 1, height - 1]))
-    low = place.floor()
-    x, y = (place - low).unbind(-1)
-    column, row = low.long().unbind(-1)
-    right, below = (column + 1).clamp_max(width - 1), (row + 1).clamp_max(height - 1)
-    base = source * height
-    taps = torch.stack(
-        [
-            (base + row) * width + column,
-            (base + row) * width + right,
-            (base + below) * width + column,
-            (base + below) * width + right,
-        ],
-        -1,
-    )
-    weight = torch.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], -1)
-    read = rows.index_select(0, taps.flatten()).view(*taps.shape, -1)
-    return (weight[:, None] @ read)[:, 0]

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.depth import DepthMaps
-from sharpfield.fields.image_features import Fetch
 
 AHEAD = 1e-6
 """Least depth of what a picture shows."""
@@ -31,7 +30,7 @@ class SourceOptions:
     choose: Literal["order", "pose"] = "order"
     """Those nearest in the order of frames, as published, or those whose cameras stand near and
     look along a ray."""
-    fetch: Fetch = "nearest"
+    fetch: Literal["nearest", "bilinear"] = "nearest"
     """Whole pixels, as published, or between them."""
     visibility: Literal["none", "depth"] = "none"
     """Whether what a picture does not show is told by its network alone, as published, or by
@@ -71,7 +70,7 @@ class ImageSources(nn.Module):
     """
 
     poses: Tensor
-    train: Tensor
+    learned: Tensor
     quality: Tensor
     by_order: Tensor
 
@@ -90,7 +89,7 @@ class ImageSources(nn.Module):
         every = np.arange(len(frames))
         tables = {
             "poses": capture.frame_pose(every).detach().float(),
-            "train": torch.as_tensor(train),
+            "learned": torch.as_tensor(train),
             "quality": torch.as_tensor(quality).float(),
             "by_order": torch.from_numpy(nearest_in_order(len(frames), train, options.count)),
         }
@@ -117,14 +116,14 @@ class ImageSources(nn.Module):
         """
         if self.options.choose == "order":
             return self.by_order[frame]
-        pose = self.poses[self.train]
+        pose = self.poses[self.learned]
         apart = torch.cdist(origin, pose[:, :, 3]) / (APART * self.capture.far)
         score = apart + 1 - direction @ pose[:, :, 2].T + EQUAL
-        score = score / self.quality[self.train].clamp_min(1e-3) ** self.options.prefer
+        score = score / self.quality[self.learned].clamp_min(1e-3) ** self.options.prefer
         if exclude:
-            score = torch.where(self.train == frame[:, None], torch.inf, score)
-        count = min(self.options.count, len(self.train) - 1)
-        return self.train[score.topk(count, largest=False).indices]
+            score = torch.where(self.learned == frame[:, None], torch.inf, score)
+        count = min(self.options.count, len(self.learned) - 1)
+        return self.learned[score.topk(count, largest=False).indices]
 
     def pictures(self, frames: Int64[Tensor, "u"]) -> Float[Tensor, "u h w c"]:
         """Some frames as stored, 0...1."""
@@ -149,7 +148,7 @@ class ImageSources(nn.Module):
         """
         pose = self.poses[frames][source]  # [n, v, 3, 4]
         way = places[:, None] - pose[..., 3]
-        seen = (way[..., None, :] @ pose[..., :3])[..., 0, :]
+        seen = (way[..., None] * pose[..., :3]).sum(-2)  # R^T way; a product of matrices is slower
         ahead = seen[..., 2] > AHEAD
         safe = torch.where(ahead[..., None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
         camera = self.capture.camera

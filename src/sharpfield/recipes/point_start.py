@@ -68,7 +68,7 @@ def starting_cloud(
     capture: Capture,
     seed: int,
     *,
-    weight: Float[np.ndarray, "n"] | None = None,
+    weight: Float[np.ndarray, "a"] | None = None,
 ) -> Cloud:
     """Points on the surfaces of a capture.
 
@@ -149,7 +149,7 @@ def colours_seen(
 
 
 def _fused(
-    options: CloudOptions, capture: Capture, weight: Float[np.ndarray, "n"] | None
+    options: CloudOptions, capture: Capture, weight: Float[np.ndarray, "a"] | None
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     voxel = options.voxel or _ninehundredth(options, capture)
 

@@ -1,0 +1,170 @@
+"""Hybrid neural rendering: rooms from blurry video, by neural points and the pictures around.
+
+P. Dai et al., *Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur*, CVPR 2023. Points
+say what is where, the frames nearby what it looks like. Rendered patches are blurred like recorded
+ones before they are compared, and sharp frames count more.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.paper import Paper
+from sharpfield.formation.patch_kernel import (
+    ChosenKernel,
+    Edge,
+    Kind,
+    LearnedKernel,
+    motion_kernels,
+)
+from sharpfield.metrics.quality import quality
+from sharpfield.recipes.frame_weights import frame_weights
+from sharpfield.recipes.image_sources import SourceOptions
+from sharpfield.recipes.picture_branch import PictureBranch
+from sharpfield.recipes.point_model import DrawOptions, PointModel
+from sharpfield.recipes.point_nerf import PointNeRF
+from sharpfield.recipes.point_scene import PointScene
+
+PAPER = Paper(
+    key="dai2023hybrid",
+    title="Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur",
+    bibtex="""@inproceedings{dai2023hybrid,
+  title     = {Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur},
+  author    = {Dai, Peng and Zhang, Yinda and Yu, Xin and Lyu, Xiaoyang and Qi, Xiaojuan},
+  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2023}
+}""",
+    departures=(
+        "Neighbours are the nearest in the window of cells; the released code stops at the first"
+        " layer of cells that holds enough, drops points by chance where a cell is full, and gives"
+        " its first occupied cell no points.",
+        "Descriptors start by chance, and networks by Xavier's rule; the released code starts them"
+        " from weights trained on another data set for a day. Such a checkpoint can be loaded"
+        " (`released`).",
+        "Depth of held-out frames is not used unless cloud.frames is `all`, as published.",
+        "The regulariser of confidence leaves out empty slots, which the released code fills with"
+        " the first point.",
+        "Rows of points that a step does not touch are left alone; the released code moves all by"
+        " the momentum of Adam. Nothing restarts when points grow.",
+        "Maps of features are read at their own size, which gives the same numbers as enlarging"
+        " them first.",
+        "Pictures do not tell about places behind their camera or a little outside their edge.",
+        "Rays that miss are left out of a patch before it is blurred; the released code blurs the"
+        " background into their neighbours.",
+        "Which patches do without pictures is drawn anew each step; the released code always takes"
+        " the same slots, whose places in the image are by chance.",
+        "New points in one round of growth all get the same share of their neighbours' confidence;"
+        " in the released code those of earlier frames get powers of it.",
+        "Points from depth are voxel means at pixel centres; the released code takes the point"
+        " nearest the mean, and is off by half a pixel.",
+        "In evaluation, the camera's axes are those of the frame nearest in time, and colour is"
+        " left out where a sample sends less than 1e-4 of a ray's light.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class BlurOptions:
+    """How rendered patches are made as blurry as recorded ones. Defaults: Full's for ScanNet."""
+
+    kind: Literal["none", "chosen", "learned"] = "chosen"
+    """Not at all (H), by the best of fixed kernels (Full), or by a network."""
+    size: int = 9
+    """Of kernels, in pixels of a patch; odd."""
+    distances: tuple[int, ...] = (1, 2, 4)
+    """How far fixed strokes reach."""
+    strokes: Kind = "both"
+    """Which there are: 36 for ScanNet; the paper's rooms have the 12 that go through the pixel."""
+    edge: Edge = "keep"
+    """What a learned kernel does at the edge of a patch."""
+    still_share: Literal["learned", "none"] = "learned"
+    """Whether the network also says how much of a pixel stays where it is."""
+    light: Literal["stored", "linear"] = "stored"
+    """What is added up: stored values, as published, or light."""
+
+
+@dataclass(frozen=True)
+class Hybrid(PointNeRF):
+    """Neural points and features of nearby pictures to a scene, from blurry video with depth."""
+
+    paper: ClassVar[Paper] = PAPER
+
+    drawn: DrawOptions = field(default_factory=lambda: DrawOptions(patches=49, side=8))
+    sources: SourceOptions = field(default_factory=SourceOptions)
+    blur: BlurOptions = field(default_factory=BlurOptions)
+    quality: Literal["even", "published", "auto", "pictures", "events"] = "published"
+    """How much each frame counts: all alike; as published; by events where there are any; by how
+    sharp frames look; by events."""
+    merge: int = 64
+    """Width of the network that weighs pictures."""
+    released: str = ""
+    """A checkpoint of the released code to start from: its `*_net_ray_marching.pth`."""
+
+    def build(self, capture: Capture, seed: int) -> PointModel:
+        """The recipe on one capture.
+
+        Raises:
+            OptionError: Blur is modelled on single pixels.
+        """
+        if self.blur.kind != "none" and self.drawn.side < 2:
+            raise OptionError(
+                "blur is modelled on patches, and single pixels are drawn",
+                got=f"blur.kind {self.blur.kind}, drawn.side {self.drawn.side}",
+                do="set drawn.side to 8, or blur.kind to none",
+            )
+        weight = quality_of(capture, self.quality)
+        scene = PointScene(self.cloud, self.sizes, self.march, capture, seed, weight=weight)
+        pictures = None
+        if self.sources.count > 0:
+            pictures = PictureBranch(
+                self.sources,
+                capture,
+                self.sizes.feature,
+                seed,
+                radius=scene.field.radius,
+                quality=weight,
+                width=self.merge,
+            )
+        return PointModel(
+            self,
+            capture,
+            seed,
+            scene,
+            pictures=pictures,
+            blur=self._blur(seed),
+            light=self.blur.light,
+            weight=weight,
+        )
+
+    def _blur(self, seed: int) -> ChosenKernel | LearnedKernel | None:
+        blur = self.blur
+        if blur.kind == "none":
+            return None
+        if blur.kind == "chosen":
+            return ChosenKernel(motion_kernels(blur.size, blur.distances, kind=blur.strokes))
+        return LearnedKernel(
+            self.drawn.side,
+            seed=seed,
+            size=blur.size,
+            edge=blur.edge,
+            still_share=blur.still_share,
+        )
+
+
+def quality_of(
+    capture: Capture, kind: Literal["even", "published", "auto", "pictures", "events"]
+) -> Float[np.ndarray, "n"]:
+    """How much each frame counts, one on average; frames that are held out count one."""
+    weight = np.ones(len(capture.needed_frames))
+    if kind == "even":
+        return weight
+    if kind == "published":
+        found = quality(capture, way="published").weights
+    else:
+        found = frame_weights(capture, kind)
+    weight[capture.split.train] = found / found.mean()
+    return weight
