@@ -11,6 +11,7 @@ from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.room_splat import RoomSplat
 from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, Splat
 
 RECIPES: dict[str, Any] = {
@@ -23,6 +24,7 @@ RECIPES: dict[str, Any] = {
     "blur-splat": BlurSplat,
     "event-splat": EventSplat,
     "ev-splat": EvSplat,
+    "room-splat": RoomSplat,
 }
 """By the name that the command line knows."""
 
@@ -55,6 +57,7 @@ __all__ = [
     "EvSplat",
     "EventSplat",
     "NeRF",
+    "RoomSplat",
     "Splat",
     "all_recipes",
     "recipe_named",
