@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +25,7 @@ from sharpfield.preparation.ingest import Ingested, Tell
 from sharpfield.preparation.ingest import ingest as ingest_recordings
 from sharpfield.preparation.ingest_choices import Choices, Cleaning, Crop, Scene, Timing
 from sharpfield.preparation.ingest_lens import Optics
-from sharpfield.recordings.open import FORMATS, format_of, open_recording
+from sharpfield.recordings.open import FORMATS, Told, format_of, open_recording
 from sharpfield.recordings.recording import Recording
 
 FRAMES_ONLY = ("video", "pictures")
@@ -48,8 +48,12 @@ class Source:
     """Of the event sensor, in pixels."""
     topic: str | None = None
     """Which of several cameras, streams or topics."""
+    image_topic: str | None = None
+    """Which of several topics of images."""
     columns: str | None = None
     """What the columns of a table of events are: xytp or txyp."""
+    event_encoding: str | None = None
+    """Of Prophesee's RAW, where the header does not say: evt2, evt2.1, evt2.1-legacy or evt3."""
     frame_unit: str | None = None
     """Of the times of pictures."""
     per_second: float | None = None
@@ -58,39 +62,60 @@ class Source:
     """The file that says when pictures were taken, where there are several."""
 
     def opened(self, path: Path) -> Recording:
-        """A recording, with those of the options that its format knows."""
-        name = format_of(path)
-        if name not in FRAMES_ONLY and self.layout is not None:
-            name = self.layout
-        if name not in FORMATS:
-            raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
-        given = {
-            "unit": self.frame_unit if name in FRAMES_ONLY else self.unit,
-            "size": None if self.size is None else parse_size(self.size),
-            "topic": self.topic,
-            "columns": self.columns,
-            "per_second": self.per_second,
-            "times": self.times,
-        }
-        taken = {option: given[option] for option in FORMATS[name].takes}
-        return open_recording(path, layout=name, **taken)
+        """A recording, told those of the options that its format knows."""
+        name = self._format(path)
+        told = replace(
+            Told(),
+            **{
+                option: value
+                for option, value in self._told(name).given().items()
+                if option in FORMATS[name].takes
+            },
+        )
+        return open_recording(path, told, layout=name)
 
-    def expect_used(self, names: list[str]) -> None:
+    def expect_used(self, paths: tuple[Path, ...]) -> None:
         """Refuse options that none of the formats knows: they would have no effect.
 
         Raises:
             OptionError: There is one.
         """
-        known = {option for name in names for option in FORMATS[name].takes}
-        events_only = all(name in FRAMES_ONLY for name in names)
-        for option in ("unit", "size", "topic", "columns", "per_second", "times"):
-            useless = option not in known or (option == "unit" and events_only)
-            if getattr(self, option) is not None and useless:
-                raise OptionError(
-                    f"--{option.replace('_', '-')} has no effect on these recordings",
-                    got=" and ".join(names),
-                    do="leave it out",
-                )
+        names = [self._format(path) for path in paths]
+        given = {option for name in names for option in self._told(name).given()}
+        used = {
+            option
+            for name in names
+            for option in self._told(name).given()
+            if option in FORMATS[name].takes
+        }
+        if useless := sorted(given - used):
+            raise OptionError(
+                f"the option `{useless[0]}` has no effect on these recordings",
+                got=" and ".join(names),
+                do="leave it out",
+            )
+
+    def _format(self, path: Path) -> str:
+        """The name of a file's format; `layout` is that of events."""
+        name = format_of(path) if self.layout is None else self.layout
+        if self.layout is not None and path.is_dir() and format_of(path) in FRAMES_ONLY:
+            name = format_of(path)
+        if name not in FORMATS:
+            raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
+        return name
+
+    def _told(self, name: str) -> Told:
+        """What is told of a file of some format."""
+        return Told(
+            unit=self.frame_unit if name in FRAMES_ONLY else self.unit,
+            size=None if self.size is None else parse_size(self.size),
+            topic=self.topic,
+            image_topic=self.image_topic,
+            columns=self.columns,
+            encoding=self.event_encoding,
+            per_second=self.per_second,
+            times=self.times,
+        )
 
 
 @dataclass(frozen=True)
@@ -134,7 +159,7 @@ def ingest(
     if len(recordings) not in (1, 2):
         raise OptionError("give one recording, or two", got=len(recordings))
     console = Console()
-    source.expect_used([source.layout or format_of(path) for path in recordings])
+    source.expect_used(recordings)
     opened = tuple(source.opened(path) for path in recordings)
     for recording in opened:
         console.print(f"{recording.path} is {recording.layout}", highlight=False)

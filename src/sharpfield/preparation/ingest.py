@@ -181,6 +181,13 @@ class _Ingest:
             )
         return recording.bayer if given is None else given.replace("none", "")
 
+    def _event_bayer(self, lens: Geometry) -> str:
+        """The filter before the event sensor; pictures of another sensor say nothing about it."""
+        assert self._events is not None
+        if self._choices.scene.bayer is None and lens.separate:
+            return ""
+        return self._bayer(self._events)
+
     def _exposure(self, taken: Taken, found: Survey | None) -> tuple[Exposure, str]:
         """When frames were exposed, on the clock of the events; and how that is known."""
         timing = self._choices.timing
@@ -241,7 +248,7 @@ class _Ingest:
             sieve.of_hot, sieve.lonely, sieve.outside = told["sifted"]
             self._left |= told["left_out"]
         else:
-            bayer = self._bayer(self._events)
+            bayer = self._event_bayer(lens)
             self._stage.write(
                 (lens.placed(sieve.sifted(chunk), bayer) for chunk in self._told(found.count)),
                 lens.placed(no_events(self._events.size), bayer),

@@ -66,6 +66,8 @@ class Geometry:
     """To scale pictures to."""
     sites: Float32[np.ndarray, "h w 2"] | None = None
     """Position of each pixel of the event sensor; None if events keep their pixels."""
+    separate: bool = False
+    """Whether frames come from another sensor than events."""
     notes: dict[str, str | float] = field(default_factory=dict[str, str | float])
 
     def picture(
@@ -133,8 +135,9 @@ def geometry(events: Size | None, frames: Size | None, optics: Optics, where: ob
             camera.scaled(frames[0] / size[0]), width=frames[0], height=frames[1]
         )
         if ideal != camera:
-            return Geometry(ideal, seen_from(ideal, camera_of_frames), sites=sites)
-        return Geometry(ideal, frame_size=size, sites=sites)
+            frame_map = seen_from(ideal, camera_of_frames)
+            return Geometry(ideal, frame_map, sites=sites, separate=True)
+        return Geometry(ideal, frame_size=size, sites=sites, separate=True)
     return Geometry(ideal, seen_from(ideal, camera) if ideal != camera else None, sites=sites)
 
 
@@ -156,6 +159,7 @@ def _uncalibrated(size: Size, frames: Size, optics: Optics, where: object) -> Ge
     return Geometry(
         camera,
         frame_size=size if frames != size else None,
+        separate=frames != size,
         notes={"intrinsics": "unknown"},
     )
 
@@ -178,6 +182,7 @@ def _from_beside(
     return Geometry(
         ideal,
         seen_from(ideal, camera, turn),
+        separate=True,
         notes={"frame_camera_distance": float(np.linalg.norm(pose[:3, 3]))},
     )
 

@@ -7,16 +7,22 @@ sensor, which of several cameras), the error asks for it by the name of the opti
 
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.aedat2 import open_aedat2
+from sharpfield.recordings.aedat3 import open_aedat3
 from sharpfield.recordings.aedat4 import open_aedat4
+from sharpfield.recordings.dat import open_dat
 from sharpfield.recordings.evt import open_evt
 from sharpfield.recordings.hdf5 import open_hdf5
+from sharpfield.recordings.nmnist import open_nmnist
 from sharpfield.recordings.npz import open_npy, open_npz, open_npz_folder
 from sharpfield.recordings.recording import Recording
+from sharpfield.recordings.rosbag import open_rosbag
+from sharpfield.recordings.text import open_text
 from sharpfield.recordings.video import open_images, open_video
 from sharpfield.storage.images import list_images
 
@@ -41,57 +47,64 @@ class Format:
     suffixes: tuple[str, ...] = ()
     """Of files whose content says nothing."""
     takes: tuple[str, ...] = ("size",)
-    """Options of `open_recording` that it knows."""
+    """What it can be told besides, see `Told`."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What the owner of a recording knows and its file does not say; None leaves it to the file."""
+
+    unit: str | None = None
+    """Of the stored times: ns, us, ms or s."""
+    size: tuple[int, int] | None = None
+    """Width and height of the event sensor in pixels."""
+    topic: str | None = None
+    """Which of several cameras, streams or topics of events."""
+    image_topic: str | None = None
+    """Which of several topics of images."""
+    columns: str | None = None
+    """What the columns of a table are, in their order, like "xytp"."""
+    encoding: str | None = None
+    """Of Prophesee's RAW: evt2, evt2.1, evt2.1-legacy or evt3."""
+    per_second: float | None = None
+    """How many frames were taken per second."""
+    times: Path | None = None
+    """The text that says when pictures were taken."""
+
+    def given(self) -> dict[str, Any]:
+        """What was not left to the file."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+NOTHING = Told()
 
 
 def open_recording(
-    path: Path | str,
-    *,
-    layout: str | None = None,
-    unit: str | None = None,
-    size: tuple[int, int] | None = None,
-    topic: str | None = None,
-    columns: str | None = None,
-    per_second: float | None = None,
-    times: Path | None = None,
+    path: Path | str, told: Told = NOTHING, *, layout: str | None = None
 ) -> Recording:
     """Open what a camera, or a program in its place, has written.
 
     Args:
         path: A file or a folder.
+        told: What the file does not say.
         layout: One of `FORMATS`; by default it is recognised.
-        unit: Of the stored times (ns, us, ms, s), where the file does not say.
-        size: Width and height of the sensor in pixels, where the file does not say.
-        topic: Which of several cameras, streams or topics.
-        columns: What the columns of a table are, like "xytp".
-        per_second: How many frames were taken per second, where the file does not say.
-        times: A text that says when pictures were taken, where there are several.
 
     Raises:
         CaptureError: It is missing, of no known format, damaged, or leaves something open.
-        OptionError: An option does not belong to the format.
+        OptionError: Something was told that does not belong to the format.
     """
     path = Path(path)
     name = layout or format_of(path)
     if name not in FORMATS:
         raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
-    options: dict[str, Any] = {
-        "unit": unit,
-        "size": size,
-        "topic": topic,
-        "columns": columns,
-        "per_second": per_second,
-        "times": times,
-    }
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given.keys() - set(FORMATS[name].takes):
+    for option in told.given().keys() - set(FORMATS[name].takes):
         able = [other for other, known in FORMATS.items() if option in known.takes]
         raise OptionError(
             f"the format {name} has no option {option}",
             where=path,
             do=f"it belongs to {', '.join(able)}",
         )
-    return FORMATS[name].open(path, **given)
+    return FORMATS[name].open(path, **told.given())
 
 
 def open_events(
@@ -107,7 +120,7 @@ def open_events(
     Raises:
         CaptureError: See `open_recording`; or it holds no events.
     """
-    opened = open_recording(path, unit=unit, size=sensor)
+    opened = open_recording(path, Told(unit=unit, size=sensor))
     if opened.events is None:
         raise CaptureError("the recording holds no events", where=path, got=opened.layout)
     return opened
@@ -155,6 +168,15 @@ def _is_evt(path: Path, head: bytes) -> bool:
     return any(line.startswith((b"% evt ", b"% format evt")) for line in lines)
 
 
+def _is_dat(path: Path, head: bytes) -> bool:
+    return head.startswith(b"%") and not _is_evt(path, head) and path.suffix != ".raw"
+
+
+def _is_bag(path: Path, head: bytes) -> bool:
+    magics = (b"#ROSBAG V2.0", b"SQLite format 3\x00", b"\x89MCAP0\r\n")
+    return head.startswith(magics) or (path / "metadata.yaml").is_file()
+
+
 def _zipped(path: Path, head: bytes, suffix: str) -> bool:
     """Whether a zip archive has a member of some name."""
     if not head.startswith(b"PK\x03\x04"):
@@ -163,7 +185,7 @@ def _zipped(path: Path, head: bytes, suffix: str) -> bool:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith(suffix) for name in archive.namelist())
     except (zipfile.BadZipFile, OSError, NotImplementedError):
-        return path.suffix == f".{suffix}"
+        return False
 
 
 def _is_video(path: Path, head: bytes) -> bool:
@@ -172,23 +194,80 @@ def _is_video(path: Path, head: bytes) -> bool:
 
 
 def _has_pictures(path: Path, head: bytes) -> bool:
-    if not path.is_dir() or (path / "events.txt").is_file():
+    if not path.is_dir() or any(
+        (path / name).is_file() for name in ("events.txt", "metadata.yaml")
+    ):
         return False
     return (path / "images.txt").is_file() or bool(list_images(path))
 
 
-def _open_evt(path: Path, **given: Any) -> Recording:
-    return open_evt(path, **given)
+def _open_rpg(
+    path: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    unit: str | None = None,
+    columns: str | None = None,
+) -> Recording:
+    """A folder of RPG's data set: `events.txt`, and `images.txt` with the pictures it names."""
+    events = open_text(path / "events.txt", size=size, unit=unit, columns=columns)
+    if not (path / "images.txt").is_file():
+        return replace(events, path=path)
+    pictures = open_images(path)
+    return replace(events, path=path, frames=pictures.frames)
 
 
 FORMATS: dict[str, Format] = {
-    "evt": Format(_is_evt, _open_evt, "events, triggers", "a header with `% evt`", (".raw",)),
+    "evt": Format(
+        _is_evt,
+        open_evt,
+        "events, triggers",
+        "a header with `% evt`",
+        (".raw",),
+        takes=("size", "encoding"),
+    ),
+    "dat": Format(_is_dat, open_dat, "events", "a header with `%` and no `% evt`", (".dat",)),
+    "aedat2": Format(
+        _begins(b"#!AER-DAT2", b"#!AER-DAT1"), open_aedat2, "events", "`#!AER-DAT2`", (".aedat",)
+    ),
+    "aedat3": Format(
+        _begins(b"#!AER-DAT3"),
+        open_aedat3,
+        "events, frames with exposures, triggers",
+        "`#!AER-DAT3`",
+        takes=("size", "topic"),
+    ),
     "aedat4": Format(
         _begins(b"#!AER-DAT4"),
         open_aedat4,
         "events, frames with exposures, triggers",
         "`#!AER-DAT4`",
         takes=("size", "topic"),
+    ),
+    "rosbag": Format(
+        _is_bag,
+        open_rosbag,
+        "events, images, triggers",
+        "a bag of ROS 1, or of ROS 2 (SQLite, MCAP)",
+        (".bag", ".db3", ".mcap"),
+        takes=("size", "topic", "image_topic"),
+    ),
+    "nmnist": Format(
+        lambda path, head: False, open_nmnist, "events", "the name FILE.bin", (".bin",)
+    ),
+    "text": Format(
+        lambda path, head: _zipped(path, head, ".txt"),
+        open_text,
+        "events",
+        "a zip of events.txt",
+        (".txt", ".csv"),
+        takes=("size", "unit", "columns"),
+    ),
+    "rpg-folder": Format(
+        lambda path, head: (path / "events.txt").is_file(),
+        _open_rpg,
+        "events, frames",
+        "a folder with events.txt",
+        takes=("size", "unit", "columns"),
     ),
     "hdf5": Format(
         _begins(b"\x89HDF\r\n\x1a\n"),
@@ -198,7 +277,7 @@ FORMATS: dict[str, Format] = {
         takes=("size", "unit", "topic"),
     ),
     "npz": Format(
-        lambda path, head: _zipped(path, head, "npy"),
+        lambda path, head: _zipped(path, head, ".npy"),
         open_npz,
         "events",
         "npz",

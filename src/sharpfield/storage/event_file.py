@@ -1,5 +1,6 @@
 """A file of events that is open but not loaded: any window of time, any part, chunk by chunk."""
 
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -23,7 +24,10 @@ SEARCHED = 2**16
 """Times unpacked at once when looking for one: an HDF5 chunk or so."""
 
 
-UNREADABLE = (OSError, EOFError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (
+    *(OSError, EOFError, ValueError, RuntimeError, SyntaxError, tokenize.TokenError),
+    *(zipfile.BadZipFile, zlib.error),
+)
 """What reading a part of a damaged file may end in."""
 
 
