@@ -7,6 +7,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 from sharpfield.core.errors import OptionError
+from sharpfield.recipes.d_nerf import DNeRF
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
@@ -17,6 +18,7 @@ from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, 
 RECIPES: dict[str, Any] = {
     "nerf": NeRF,
     "ev-deblur-nerf": EvDeblurNeRF,
+    "d-nerf": DNeRF,
     "evdnerf": EvDNeRF,
     "evdnerf-physical": EvDNeRFPhysical,
     "splat": Splat,
@@ -50,6 +52,7 @@ def recipe_named(name: str) -> Any:
 __all__ = [
     "RECIPES",
     "BlurSplat",
+    "DNeRF",
     "EvDNeRF",
     "EvDNeRFPhysical",
     "EdiSplat",

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from sharpfield.fields.space_time import SpaceTimeSize
+from sharpfield.recipes.d_nerf import DNeRF
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 
@@ -36,6 +37,23 @@ def evdnerf_paper(recipe: EvDNeRF) -> EvDNeRF:
     return recipe
 
 
+def d_nerf_draft(recipe: DNeRF) -> DNeRF:
+    """Smaller networks, fewer pixels, a higher rate; minutes on two processor cores."""
+    scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
+    return replace(recipe.lasting(2000), rate=2e-3, pixels=256, scene=scene)
+
+
+def d_nerf_standard(recipe: DNeRF) -> DNeRF:
+    """Half as wide; for a graphics card."""
+    scene = replace(recipe.scene, width=128, samples=(48, 64))
+    return replace(recipe.lasting(40_000), rate=1e-3, pixels=1024, scene=scene)
+
+
+def d_nerf_paper(recipe: DNeRF) -> DNeRF:
+    """The published networks and length."""
+    return recipe
+
+
 def physical_draft(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
     """Minutes on two processor cores."""
     windows = replace(recipe.windows, spans=192, counted=192)
@@ -52,4 +70,5 @@ def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
 
 EVDNERF_VARIANTS = {"lego": lego, "real": real}
 EVDNERF_SIZES = {"draft": evdnerf_draft, "standard": evdnerf_standard, "paper": evdnerf_paper}
+D_NERF_SIZES = {"draft": d_nerf_draft, "standard": d_nerf_standard, "paper": d_nerf_paper}
 PHYSICAL_SIZES = {"draft": physical_draft, "standard": physical_standard}

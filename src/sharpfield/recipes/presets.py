@@ -14,7 +14,12 @@ from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.event_term import EventOptions
 from sharpfield.recipes.frame_term import FrameOptions
 from sharpfield.recipes.learned_blur import KernelOptions
-from sharpfield.recipes.moving_presets import EVDNERF_SIZES, EVDNERF_VARIANTS, PHYSICAL_SIZES
+from sharpfield.recipes.moving_presets import (
+    D_NERF_SIZES,
+    EVDNERF_SIZES,
+    EVDNERF_VARIANTS,
+    PHYSICAL_SIZES,
+)
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.prior import PriorOptions
 from sharpfield.recipes.splats import Splat
@@ -184,6 +189,7 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
         "cdavis_full": cdavis_full,
     },
     "nerf": {},
+    "d-nerf": {},
     "evdnerf": EVDNERF_VARIANTS,
     "evdnerf-physical": {},
     **dict.fromkeys(SPLATS, {"refine": refine}),
@@ -193,6 +199,7 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
 SIZES: Mapping[str, Mapping[str, Change]] = {
     "ev-deblur-nerf": {"draft": draft, "standard": standard, "paper": paper},
     "nerf": {"draft": nerf_draft, "standard": nerf_standard, "paper": nerf_paper},
+    "d-nerf": D_NERF_SIZES,
     "evdnerf": EVDNERF_SIZES,
     "evdnerf-physical": PHYSICAL_SIZES,
     **dict.fromkeys(SPLATS, {"draft": splat_draft, "standard": splat_standard}),

@@ -1,0 +1,130 @@
+"""D-NeRF: a moving scene from frames. What events must beat where frames are blurred or few.
+
+A. Pumarola et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021. Frames may come
+from anywhere: a camera, another model's renders, or a network that makes pictures of events; see
+`sharpfield ingest` and the layout `d-nerf`.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.captures import draw_pixels, pixel_table
+from sharpfield.core.capture import Capture
+from sharpfield.core.measurements import Batch, Pixels
+from sharpfield.core.paper import Paper
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group, exponential
+from sharpfield.formation.shutter import Shutter
+from sharpfield.formation.tone import tone_of
+from sharpfield.losses.photometric import mse
+from sharpfield.recipes.frame_term import Terms
+from sharpfield.recipes.volume import stages
+from sharpfield.recipes.warped_scene import WarpedOptions, WarpedScene
+
+PAPER = Paper(
+    key="pumarola2021dnerf",
+    title="D-NeRF: Neural Radiance Fields for Dynamic Scenes",
+    bibtex="""@inproceedings{pumarola2021dnerf,
+  title     = {{D-NeRF}: Neural Radiance Fields for Dynamic Scenes},
+  author    = {Pumarola, Albert and Corona, Enric and Pons-Moll, Gerard and
+               Moreno-Noguer, Francesc},
+  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2021}
+}""",
+    departures=(
+        "The scene is linear light, and frames are encoded by their own response.",
+        "Pixels are drawn from all frames at once; the published code draws them from one frame"
+        " and opens later and later frames.",
+        "There is no term for the total variation of displacements, which published configurations"
+        " leave out.",
+        "Blurred frames may be explained by several instants of the exposure (`instants`).",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class DNeRF:
+    """Frames of a moving scene, through a canonical scene and a deformation."""
+
+    paper: ClassVar[Paper] = PAPER
+
+    steps: int = 800_000
+    """Length of the schedule."""
+    rate: float = 5e-4
+    """First learning rate."""
+    decay: int = 500_000
+    """Steps in which it falls to a tenth."""
+    pixels: int = 500
+    """Drawn per step."""
+    instants: int = 1
+    """Of an exposure that lasts: 1 takes frames as they are."""
+    scene: WarpedOptions = field(
+        default_factory=lambda: WarpedOptions(
+            colours=3, networks=2, density="relu", opaque_end=False, shared_jitter=True
+        )
+    )
+
+    def lasting(self, steps: int) -> "DNeRF":
+        """The same recipe with its whole schedule stretched or shrunk to `steps`."""
+        return replace(self, steps=steps, decay=max(round(self.decay * steps / self.steps), 1))
+
+    def build(self, capture: Capture, seed: int) -> "Model":
+        """The recipe on one capture."""
+        return Model(self, capture, seed)
+
+
+class Model(nn.Module):
+    """A moving scene and the frames it explains; events are not used."""
+
+    heaviest_step = 0
+
+    def __init__(self, recipe: DNeRF, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.recipe, self.seed = recipe, seed
+        frames = capture.needed_frames
+        self.scene = WarpedScene(recipe.scene, capture, seed)
+        self.capture = self.scene.capture
+        self.tone = tone_of(frames.encoding)
+        self.pixels = pixel_table(self.capture)
+        instants = 1 if frames.exposure.instant.all() else recipe.instants
+        camera, path = self.capture.camera, self.capture.trajectory
+        self.shutter = Shutter(camera, path, instants, self.tone.encode)
+        self.rate = exponential(recipe.rate, recipe.rate / 10, until=recipe.decay)
+
+    def draw(self, step: int) -> Batch:
+        """Pixels of the training frames."""
+        return {
+            "frames": draw_pixels(
+                self.pixels,
+                self.recipe.pixels,
+                seed=self.seed,
+                step=step,
+                device=self.scene.device,
+            )
+        }
+
+    def losses(self, batch: Batch, step: int) -> Terms:
+        """Error of the pixels, coarse and fine."""
+        assert isinstance(seen := batch["frames"], Pixels)
+        light = self.scene.sharp(self.shutter.expose(seen), step, "frames")
+        names = ("coarse", "fine") if light.coarse is not None else ("fine",)
+        return {
+            name: mse(self.shutter.observe(stage, seen), seen.value)
+            for name, stage in zip(names, reversed(stages(light)), strict=True)
+        }
+
+    def render(self, rays: Rays) -> Radiance:
+        """Linear light."""
+        return self.scene.view(rays)
+
+    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """As the frames store it."""
+        return self.tone.encode(light).clamp(0, 1)
+
+    def groups(self) -> list[Group]:
+        """All networks at one rate."""
+        return self.scene.groups(self.rate)
