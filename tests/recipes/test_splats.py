@@ -19,6 +19,7 @@ from sharpfield.recipes.unknowns import UnknownOptions
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
 from sharpfield.simulation import EventSensor, Rig, Timing, simulate
 from sharpfield.training import Options, adam, file_of, fit, train
+from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
 
 NAMES = ("splat", "edi-splat", "blur-splat", "event-splat", "ev-splat")
@@ -252,3 +253,8 @@ def test_a_scene_can_be_seen_through_another_lens() -> None:
     assert seen.shape == (72, 96, 3)
     shrunk = seen.reshape(24, 3, 32, 3, 3).mean((1, 3))
     assert (shrunk - own.rgb).abs().mean() < 0.2 * (own.rgb - own.rgb.mean()).abs().mean()
+
+
+def test_events_of_several_cameras_are_refused():
+    with pytest.raises(CaptureError, match="events of 2 cameras|events of 3 cameras"):
+        small("ev-splat").build(tiny_moving(30_000), 0)

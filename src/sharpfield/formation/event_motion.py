@@ -30,9 +30,18 @@ class EventMotion:
         """The motion that a capture's events tell.
 
         Raises:
-            CaptureError: There are no events, or they and the frames differ in size.
+            CaptureError: There are no events, they and the frames differ in size, or they come
+                from several cameras.
         """
         events, camera = capture.needed_events, capture.camera
+        if events.tracks > 1:
+            raise CaptureError(
+                "deblurring needs the events of one camera",
+                where=capture.name,
+                got=f"events of {events.tracks} cameras",
+                do="train a recipe for rigs: evdnerf-physical, evdnerf, d-nerf; or leave the events"
+                " out (--use frames)",
+            )
         if (events.width, events.height) != camera.size:
             raise CaptureError(
                 "deblurring needs events and frames of the same pixels",
