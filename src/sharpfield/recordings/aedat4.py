@@ -86,14 +86,15 @@ def open_aedat4(
     layout = _layout(path)
     events, frames = (_chosen(layout, kind, topic) for kind in ("EVTS", "FRME"))
     triggers = [stream.number for stream in layout.streams.values() if stream.kind == "TRIG"]
-    if events is not None or size is not None:
-        stated = layout.streams[events].size if events is not None else None
-        size = known_size(stated, size, path)
+    read_events = None
+    if events is not None:
+        size = known_size(layout.streams[events].size, size, path)
+        read_events = partial(_events, layout, events, size)
     return Recording(
         path,
         "AEDAT4",
         size,
-        events=None if events is None else partial(_events, layout, events, size),
+        events=read_events,
         frames=None if frames is None else partial(_frames, layout, frames),
         triggers=partial(_triggers, layout, triggers) if triggers else None,
         trouble=layout.trouble,

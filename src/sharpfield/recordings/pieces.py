@@ -130,10 +130,10 @@ class _Gate:
         self._trouble.note("events earlier than those before them", back)
         self._back += back
         if self._back > max(BACK_EVENTS, BACK_SHARE * (self._seen + len(piece))):
-            kept = np.flatnonzero(keep)
-            late = int(np.flatnonzero(~keep & (piece.t_us < self._last_us))[-1:].sum())
-            before = kept[kept < late]
-            latest = int(piece.t_us[before[-1]]) if len(before) else self._last_us
+            width, height = self._size
+            inside = (piece.x < width) & (piece.y < height)
+            late = int(np.flatnonzero(inside & ~keep)[0])
+            latest = max([self._last_us, *piece.t_us[:late][keep[:late]][-1:].tolist()])
             raise CaptureError(
                 "event times are not ascending",
                 where=self._where,

@@ -15,6 +15,9 @@ from sharpfield.recordings.recording import Trouble
 from sharpfield.recordings.unpacking import Damaged, unpacked
 
 MAGIC = b"SQLite format 3\0"
+FAILURES = (sqlite3.Error, UnicodeDecodeError)
+"""Of a damaged database; the second, when not even the message of the first can be read."""
+
 ZSTD = b"\x28\xb5\x2f\xfd"
 """What a compressed message begins with; others begin with 0."""
 
@@ -30,7 +33,7 @@ def open_sqlite_bag(path: Path) -> Bag:
     try:
         with closing(_connected(path)) as database:
             rows = database.execute("SELECT id, name, type FROM topics").fetchall()
-    except sqlite3.Error as error:
+    except FAILURES as error:
         raise CaptureError("the file is no bag of ROS 2", where=path, got=error) from None
     topics = {str(name): topic_of(str(kind), cdr=True) for _, name, kind in rows}
     numbers = {number: str(name) for number, name, _ in rows}
@@ -50,7 +53,7 @@ def open_sqlite_bag(path: Path) -> Bag:
                         yield Message(numbers[number], int(logged_ns), _plain(data))
                     except (Damaged, ValueError, TypeError, OverflowError):
                         trouble.note("damaged messages")
-        except sqlite3.Error:
+        except FAILURES:
             trouble.note("torn ends of the file")
 
     return Bag(path, "ROS2 SQLite bag", topics, messages)

@@ -1,0 +1,39 @@
+import bz2
+
+import pytest
+
+from sharpfield.recordings.unpacking import Damaged, unpacked
+
+DATA = bytes(range(256)) * 100
+
+
+def packed(packing: str) -> bytes:
+    if packing == "bz2":
+        return bz2.compress(DATA)
+    if packing == "lz4":
+        return pytest.importorskip("lz4.frame").compress(DATA)
+    return pytest.importorskip("zstandard").ZstdCompressor().compress(DATA)
+
+
+@pytest.mark.parametrize("packing", ["bz2", "lz4", "zstd"])
+def test_blocks(packing: str, monkeypatch) -> None:
+    assert unpacked(packed(packing), packing) == DATA
+    monkeypatch.setattr("sharpfield.recordings.unpacking.PORTION", 1000)
+    assert unpacked(packed(packing), packing) == DATA
+    assert unpacked(DATA, "none") is DATA
+
+
+@pytest.mark.parametrize("packing", ["bz2", "lz4", "zstd"])
+def test_damage(packing: str, monkeypatch) -> None:
+    data = packed(packing)
+    for broken in (b"", data[:3], data[: len(data) // 2], b"x" + data):
+        with pytest.raises(Damaged):
+            unpacked(broken, packing)
+    monkeypatch.setattr("sharpfield.recordings.unpacking.LIMIT", len(DATA) - 1)
+    with pytest.raises(Damaged, match="grows without end"):
+        unpacked(data, packing)
+
+
+def test_unknown_packings() -> None:
+    with pytest.raises(Damaged, match="packing 'rar'"):
+        unpacked(b"", "rar")
