@@ -151,7 +151,7 @@ class PointField(nn.Module):
         """Of the points around places, nearer ones counting more."""
         taken, place = compact(rows.clamp_min(0))
         colours = take_rows(self.points.colours, taken)
-        around = colours.index_select(0, place.flatten()).view(*place.shape, -1)
+        around = colours.index_select(0, place.flatten()).view(*place.shape, colours.shape[-1])
         return averaged(around, shares(way, rows >= 0)).clamp(0, 1)
 
     def _read(
@@ -169,7 +169,7 @@ class PointField(nn.Module):
         parts = [own.descriptors, interleaved(own.descriptors, self.sizes.octaves[0])]
         point = torch.cat(parts, -1).to(self.precision)
         told = self.reading.first(point).index_select(0, place.flatten())
-        told = told.view(*place.shape, -1)
+        told = told.view(*place.shape, told.shape[-1])
         return leaky(told + self.reading.first(ways, skipped=point.shape[-1]))
 
     def _seen(
@@ -177,7 +177,7 @@ class PointField(nn.Module):
     ) -> Float[Tensor, "q k s"]:
         """Colours of points, and how the directions they were first seen from differ from ours."""
         known = torch.cat([own.colours, own.directions], -1)
-        known = known.index_select(0, place.flatten()).view(*place.shape, -1)
+        known = known.index_select(0, place.flatten()).view(*place.shape, known.shape[-1])
         colour, first = known[..., :-3], known[..., -3:]
         along = (first * direction[:, None]).sum(-1, keepdim=True)
         return torch.cat([colour, first - direction[:, None], along], -1).to(self.precision)

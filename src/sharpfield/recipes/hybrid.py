@@ -6,6 +6,7 @@ ones before they are compared, and sharp frames count more.
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -23,6 +24,7 @@ from sharpfield.formation.patch_kernel import (
 )
 from sharpfield.metrics.quality import quality
 from sharpfield.recipes.frame_weights import frame_weights
+from sharpfield.recipes.hybrid_checkpoint import load_released
 from sharpfield.recipes.image_sources import SourceOptions
 from sharpfield.recipes.picture_branch import PictureBranch
 from sharpfield.recipes.point_model import DrawOptions, PointModel
@@ -129,7 +131,7 @@ class Hybrid(PointNeRF):
                 quality=weight,
                 width=self.merge,
             )
-        return PointModel(
+        model = PointModel(
             self,
             capture,
             seed,
@@ -139,6 +141,9 @@ class Hybrid(PointNeRF):
             light=self.blur.light,
             weight=weight,
         )
+        if self.released:
+            load_released(Path(self.released), scene.field, model.head, pictures, model.blur)
+        return model
 
     def _blur(self, seed: int) -> ChosenKernel | LearnedKernel | None:
         blur = self.blur

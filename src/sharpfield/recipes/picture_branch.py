@@ -101,7 +101,7 @@ class PictureBranch(nn.Module):
         shown = self.sources.show(asked.place, asked.direction, ready.frames, source)
         xy = shown.xy.floor() + 0.5 if self.options.fetch == "nearest" else shown.xy
         looked = look_up(xy.flatten(0, 1), source.flatten(), ready.levels)
-        looked = looked.view(*source.shape, -1)
+        looked = looked.view(*source.shape, looked.shape[-1])
         with_pictures = ~ready.alone[asked.ray][:, None]
         merged, weight = self.merging(looked, feature, shown.change, shown.visible)
         weight = weight * with_pictures
