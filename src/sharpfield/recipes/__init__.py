@@ -11,7 +11,9 @@ from sharpfield.recipes.d_nerf import DNeRF
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
+from sharpfield.recipes.hybrid import Hybrid
 from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.room_splat import RoomSplat
 from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, Splat
 
@@ -21,6 +23,8 @@ RECIPES: dict[str, Any] = {
     "d-nerf": DNeRF,
     "evdnerf": EvDNeRF,
     "evdnerf-physical": EvDNeRFPhysical,
+    "point-nerf": PointNeRF,
+    "hybrid": Hybrid,
     "splat": Splat,
     "edi-splat": EdiSplat,
     "blur-splat": BlurSplat,
@@ -59,7 +63,9 @@ __all__ = [
     "EvDeblurNeRF",
     "EvSplat",
     "EventSplat",
+    "Hybrid",
     "NeRF",
+    "PointNeRF",
     "RoomSplat",
     "Splat",
     "all_recipes",

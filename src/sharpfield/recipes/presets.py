@@ -21,6 +21,7 @@ from sharpfield.recipes.moving_presets import (
     PHYSICAL_SIZES,
 )
 from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.point_presets import HYBRID_SIZES, HYBRID_VARIANTS, POINT_SIZES
 from sharpfield.recipes.prior import PriorOptions
 from sharpfield.recipes.splats import Splat
 from sharpfield.recipes.volume import VolumeOptions
@@ -192,6 +193,8 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
     "d-nerf": {},
     "evdnerf": EVDNERF_VARIANTS,
     "evdnerf-physical": {},
+    "point-nerf": {},
+    "hybrid": HYBRID_VARIANTS,
     **dict.fromkeys(SPLATS, {"refine": refine}),
 }
 """What is modelled, by recipe."""
@@ -202,6 +205,8 @@ SIZES: Mapping[str, Mapping[str, Change]] = {
     "d-nerf": D_NERF_SIZES,
     "evdnerf": EVDNERF_SIZES,
     "evdnerf-physical": PHYSICAL_SIZES,
+    "point-nerf": POINT_SIZES,
+    "hybrid": HYBRID_SIZES,
     **dict.fromkeys(SPLATS, {"draft": splat_draft, "standard": splat_standard}),
 }
 """How much of it, by recipe."""
