@@ -335,6 +335,12 @@ def test_torn_bags_are_read_as_far_as_they_go(tmp_path: Path) -> None:
         assert "torn ends of the file" in read.trouble.counts
 
 
+def test_a_bag_is_known_by_what_it_begins_with(tmp_path: Path) -> None:
+    ros, events = Ros("ros1"), late_events(100)
+    path = ros.write(tmp_path, arrays(ros, events))
+    expect_equal_events(open_rosbag(path.rename(tmp_path / "a.bag.active")).load(), events)
+
+
 def test_files_of_a_bag_follow_each_other_by_number(tmp_path: Path) -> None:
     ros, events = Ros("mcap"), late_events(330)
     folder = tmp_path / "whole"

@@ -21,8 +21,9 @@ from itertools import islice
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings import libcaer
+from sharpfield.recordings import libcaer, mcap, ros1_bag, sqlite_bag
 from sharpfield.recordings.bag import Bag, Fields, Message
+from sharpfield.recordings.blocks import head
 from sharpfield.recordings.event_messages import (
     ARRAYS,
     PACKETS,
@@ -41,7 +42,12 @@ from sharpfield.recordings.ros1_bag import open_ros1_bag
 from sharpfield.recordings.sqlite_bag import open_sqlite_bag
 from sharpfield.recordings.unpacking import Damaged
 
-OPENERS = {".bag": open_ros1_bag, ".mcap": open_mcap, ".db3": open_sqlite_bag}
+OPENERS = {
+    ros1_bag.FIRST_LINE: open_ros1_bag,
+    mcap.MAGIC: open_mcap,
+    sqlite_bag.MAGIC: open_sqlite_bag,
+}
+"""By what a file begins with: bags that broke off have other names."""
 
 EVENT_TYPES, IMAGE_TYPES = (*ARRAYS, *PACKETS), (PLAIN, COMPRESSED)
 EXPOSURE_TYPE = "sensor_msgs/TimeReference"
@@ -112,11 +118,16 @@ def open_rosbag(
 def _opened(path: Path) -> Bag:
     """The bag, be it a file, or a folder of files that follow each other."""
     if not path.is_dir():
-        if path.suffix not in OPENERS:
-            raise CaptureError(
-                "the file is no bag", where=path, do=f"open a file {', '.join(OPENERS)}"
-            )
-        return OPENERS[path.suffix](path)
+        start = head(path, 16)
+        for magic, open_file in OPENERS.items():
+            if start.startswith(magic):
+                return open_file(path)
+        raise CaptureError(
+            "the file is no bag",
+            where=path,
+            got=start,
+            do="open a .bag of ROS 1, or a .db3 or .mcap of ROS 2",
+        )
     paths = [file for file in path.iterdir() if file.suffix in (".mcap", ".db3")]
     if not paths or len({file.suffix for file in paths}) > 1:
         raise CaptureError(
@@ -125,7 +136,7 @@ def _opened(path: Path) -> Bag:
             got=", ".join(sorted(file.name for file in path.iterdir())[:8]) or "an empty folder",
             do="it should hold one or several .db3, or .mcap; unpack files in .zstd first",
         )
-    return _chained(path, [OPENERS[file.suffix](file) for file in sorted(paths, key=_number)])
+    return _chained(path, [_opened(file) for file in sorted(paths, key=_number)])
 
 
 def _number(path: Path) -> tuple[int, str]:
