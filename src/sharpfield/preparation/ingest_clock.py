@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, no_type_check
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from numba import njit
 
 from sharpfield.core.errors import CaptureError, OptionError
@@ -43,7 +43,7 @@ class Offset:
     correlation: float
     """Of the change of pictures with the number of events, at this offset."""
     runner_up: float
-    """The same of the best offset that is farther off than a frame."""
+    """The same of the best offset that does not lie on the same hill."""
     within_us: int
     """Offsets that fit as well, up to chance, lie no farther off."""
     sigmas: float
@@ -121,7 +121,7 @@ def triggered(triggers: Triggers, count: int, *, channel: int | None, where: obj
             "there must be one pulse on the trigger for each frame",
             where=where,
             got=f"{pulses} pulses{'' if alternate else ' with edges missing'}, {count} frames",
-            do="crop one of the recordings, or leave the triggers out and give an offset",
+            do="crop one of the recordings, or use --clock find, or give --offset-ms",
         )
     return Exposure(t_us[0 : 2 * pulses : 2], t_us[1 : 2 * pulses : 2])
 
@@ -165,20 +165,21 @@ def find_offset(
             do="give recordings of the same time",
         )
     filled = np.nan_to_num(found, nan=-1.0)
-    far = np.abs(tried - tried[filled.argmax()]) > interval
+    far = ~_hill(filled)
     runner_up = float(filled[far].max()) if far.any() else -1.0
     tried = tried[filled.argmax()] + np.arange(-interval, interval + 1)
     filled = np.nan_to_num(_correlations(ms, change, until, tried, fewest), nan=-1.0)
     best = int(filled.argmax())
     error = 1 / np.sqrt(len(change) - 3)  # of Fisher's transform of a correlation
-    good = np.flatnonzero(_fisher(filled) >= _fisher(filled[best]) - error)
+    clear = _fisher(filled)
+    good = np.flatnonzero(clear >= clear[best] - error)
     offset_us = round(1000 * (float(tried[best]) + _vertex(filled, best)))
     return Offset(
         offset_us=offset_us + origin_us - int(middles_us[0]),
         correlation=float(filled[best]),
         runner_up=runner_up,
         within_us=1000 * max(int(np.abs(tried[good] - tried[best]).max()), 1),
-        sigmas=float((_fisher(filled[best]) - _fisher(np.array(runner_up))) / (error * np.sqrt(2))),
+        sigmas=float((clear[best] - _fisher(np.array(runner_up))) / (error * np.sqrt(2))),
     )
 
 
@@ -190,7 +191,20 @@ def shifted(exposure: Exposure, offset_us: int) -> Exposure:
 
 
 def _fisher(correlation: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    return np.arctanh(np.clip(correlation, -0.999999, 0.999999))
+    """A transform of correlations whose errors are alike."""
+    return np.asarray(np.arctanh(np.clip(correlation, -0.999999, 0.999999)))
+
+
+def _hill(values: Float64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """The stretch around the highest value on which none is less than half of it."""
+    best = int(values.argmax())
+    low = np.flatnonzero(values < HALF * values[best])
+    before, after = low[low < best], low[low > best]
+    first = before[-1] + 1 if len(before) else 0
+    last = after[0] if len(after) else len(values)
+    hill = np.zeros(len(values), bool)
+    hill[first:last] = True
+    return hill
 
 
 def _vertex(values: Float64[np.ndarray, "n"], at: int) -> float:
