@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from sharpfield.cli.calibrate_command import calibrate
+from sharpfield.cli.blocks_command import blocks
 from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
 from sharpfield.cli.event_commands import events
 from sharpfield.cli.export_command import export
 from sharpfield.cli.ingest_command import ingest
 from sharpfield.cli.poses_command import poses
+from sharpfield.cli.quality_commands import blur, quality
 from sharpfield.cli.recipe_commands import recipes
 from sharpfield.cli.run_commands import evaluate, render, train
 from sharpfield.core.errors import SharpfieldError
@@ -23,9 +25,12 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "ingest": ingest,
     "inspect": inspect,
     "deblur": deblur,
+    "quality": quality,
+    "blur": blur,
     "poses": poses,
     "calibrate": calibrate,
     "train": train,
+    "blocks": blocks,
     "evaluate": evaluate,
     "render": render,
     "events": events,

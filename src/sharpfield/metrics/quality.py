@@ -1,0 +1,275 @@
+"""How sharp the frames of a video are, told apart from what they show; and what weight that earns.
+
+The *response* of a picture says how it bends: second derivatives of its local mean. Their variance
+falls with blur, but also differs from place to place. So two frames are compared only where they
+show the same (their *overlap*), and comparisons of neighbours are put together to one *score* for
+each frame. Scores are relative: their unit means nothing. *Weights* compare a frame with those
+around it and are 1 on average.
+
+Source: Hybrid Neural Rendering (CVPR 2023), content-aware blur detection; its released code for
+the numbers. There, the response is a Laplacian, overlaps come from learned optical flow, each frame
+is compared with the next, and ratios are multiplied along the video (`chained`), which drifts. Here
+(`reconciled`), the response is looked at across and down, since shake blurs one way; overlaps come
+from depth where it is known, else from DIS flow; and comparisons with several neighbours, and
+faintly with the picture's own variance, are brought to agree.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.frames import Frames
+from sharpfield.metrics.event_blur import event_blur
+from sharpfield.metrics.overlap import Overlap, depth_overlap, flow_overlap
+
+WIDTH = 640
+"""Pictures are compared at this width, in px."""
+SMOOTHED, SMOOTHED_PUBLISHED = 3, 5
+"""Side of the mean filter, in px."""
+WINDOW, STRIDE = 10, 5
+"""Frames that a weight compares, and from one such window to the next."""
+NEIGHBOURS = 4
+"""Each frame is compared with so many after it."""
+ANCHORS = {"depth": 0.05, "flow": 0.2}
+"""How much a picture's own variance counts against one comparison; flow errs more than depth."""
+LEAST_SHARE = 0.02
+"""Comparisons over a smaller share of the picture are left out."""
+TINY = 1e-9
+
+Means = Literal["auto", "depth", "flow"]
+"""Where overlaps come from; "auto" takes depth where the capture has it."""
+Way = Literal["reconciled", "published"]
+Source = Literal["auto", "pictures", "events"]
+"""What tells how sharp a frame is; "auto" takes events where the capture has them."""
+SOFTEST_PX = 0.5
+"""Blur that no lens or pixel is without: added to the measured one."""
+
+
+Picture = UInt8[np.ndarray, "h w"]
+Response = Float32[np.ndarray, "h w"]
+Responses = Sequence[Response] | Mapping[int, Response]
+Seen = Callable[[int, int], Overlap]
+"""What two frames both show."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Variance of the responses of two frames over what both show."""
+
+    i: int
+    """Position of the first frame among those compared."""
+    j: int
+    first: float
+    second: float
+    share: float
+    """How much of the picture both show."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Scores and weights of some frames."""
+
+    frames: Int64[np.ndarray, "m"]
+    """Their indices."""
+    scores: Float64[np.ndarray, "m"]
+    """The larger, the sharper."""
+    weights: Float64[np.ndarray, "m"]
+
+
+def quality(
+    capture: Capture,
+    *,
+    frames: Int64[np.ndarray, "m"] | None = None,
+    overlap: Means = "auto",
+    way: Way = "reconciled",
+) -> Quality:
+    """Scores and weights of frames, judged by their pictures.
+
+    Args:
+        capture: A video: frames are compared with those that follow.
+        frames: Which, in order of time; by default those that are learned from.
+        overlap: How to find what two frames both show.
+        way: "published" compares each frame with the next only and multiplies.
+
+    Raises:
+        OptionError: Overlaps shall come from depth, and there is none.
+    """
+    chosen = capture.split.train if frames is None else frames
+    if overlap == "depth" and capture.depth is None:
+        raise OptionError("the capture has no depth", where=capture.name, do="take overlap flow")
+    by_depth = capture.depth is not None and overlap != "flow"
+    pictures = [grey(capture.needed_frames, int(i)) for i in chosen]
+    size = pictures[0].shape[1], pictures[0].shape[0]
+
+    def seen(i: int, j: int) -> Overlap:
+        if by_depth:
+            return depth_overlap(capture, int(chosen[i]), int(chosen[j]), size)
+        return flow_overlap(pictures[i], pictures[j])
+
+    if way == "published":
+        scores = _published(pictures, seen)
+    else:
+        scores = _reconciled(pictures, seen, anchor=ANCHORS["depth" if by_depth else "flow"])
+    return Quality(chosen, scores, window_weights(scores))
+
+
+def event_quality(capture: Capture, *, frames: Int64[np.ndarray, "m"] | None = None) -> Quality:
+    """Scores and weights of frames, judged by the events of their exposures.
+
+    A score is one over the blur in px, see `metrics.event_blur`.
+
+    Raises:
+        CaptureError: There are no events, or they are of several cameras.
+    """
+    chosen = capture.split.train if frames is None else frames
+    scores = 1 / (SOFTEST_PX + event_blur(capture, frames=chosen))
+    return Quality(chosen, scores, window_weights(scores))
+
+
+def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.ndarray, "n"]:
+    """A weight for each frame: about 1 on average over those learned from, and 1 for the others.
+
+    Args:
+        capture: With frames, and for "events" with events.
+        source: What tells.
+
+    Raises:
+        CaptureError: There are no events, or they are of several cameras.
+    """
+    with_events = capture.events is not None and capture.events.track is None
+    if source == "events" or (source == "auto" and with_events):
+        found = event_quality(capture)
+    else:
+        found = quality(capture)
+    weights = np.ones(len(capture.needed_frames))
+    weights[found.frames] = found.weights
+    return weights
+
+
+def _published(pictures: Sequence[Picture], seen: Seen) -> Float64[np.ndarray, "m"]:
+    responses = [laplacian(picture) for picture in pictures]
+    pairs = [compared(i, i + 1, responses, seen(i, i + 1)) for i in range(len(pictures) - 1)]
+    own = float(responses[-1].astype(np.float64).var())
+    first = np.array([pair.first for pair in pairs] + [own])
+    return chained(first, np.array([pair.second for pair in pairs] + [own]))
+
+
+def _reconciled(
+    pictures: Sequence[Picture], seen: Seen, *, anchor: float
+) -> Float64[np.ndarray, "m"]:
+    bent = [bending(picture) for picture in pictures]
+    pairs: tuple[list[Comparison], list[Comparison]] = ([], [])
+    for i in range(len(pictures)):
+        for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(pictures))):
+            both = seen(i, j)
+            for way, found in enumerate(pairs):
+                found.append(compared(i, j, {i: bent[i][way], j: bent[j][way]}, both))
+    own = [np.array([one[way].astype(np.float64).var() for one in bent]) for way in (0, 1)]
+    scores = [reconciled(own[way], pairs[way], anchor=anchor) for way in (0, 1)]
+    return np.sqrt(scores[0] * scores[1])
+
+
+def grey(frames: Frames, frame: int) -> UInt8[np.ndarray, "h w"]:
+    """A frame as it is compared: stored values, grey, 640 px wide."""
+    image = np.asarray(frames.images[frame])
+    if image.dtype != np.uint8:
+        image = np.rint(image * (255.0 / frames.white)).astype(np.uint8)
+    flat = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if frames.channels == 3 else image[..., 0]
+    height = round(WIDTH * frames.height / frames.width)
+    larger = frames.width < WIDTH
+    return cv2.resize(
+        flat, (WIDTH, height), interpolation=cv2.INTER_LINEAR if larger else cv2.INTER_AREA
+    )
+
+
+def laplacian(picture: Picture) -> Response:
+    """Laplacian (four neighbours) of the mean over 5x5 px, signed: the published response."""
+    smooth = cv2.blur(picture.astype(np.float32), (SMOOTHED_PUBLISHED, SMOOTHED_PUBLISHED))
+    return cv2.Laplacian(smooth, cv2.CV_32F, ksize=1)
+
+
+def bending(picture: Picture) -> tuple[Response, Response]:
+    """Second derivatives of the mean over 3x3 px, across and down."""
+    smooth = cv2.blur(picture.astype(np.float32), (SMOOTHED, SMOOTHED))
+    return cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
+
+
+def compared(i: int, j: int, responses: Responses, both: Overlap) -> Comparison:
+    """How the responses of two frames vary over what both show.
+
+    Args:
+        i: The first.
+        j: The second.
+        responses: Of both, by these numbers.
+        both: Where the first frame shows the same as the second.
+    """
+    if not len(both.here):
+        return Comparison(i, j, 0.0, 0.0, 0.0)
+    one, other = (
+        responses[k][place[:, 0], place[:, 1]].astype(np.float64)
+        for k, place in ((i, both.here), (j, both.there))
+    )
+    return Comparison(i, j, float(one.var()), float(other.var()), both.share)
+
+
+def chained(
+    current: Float64[np.ndarray, "m"], following: Float64[np.ndarray, "m"]
+) -> Float64[np.ndarray, "m"]:
+    """Scores from comparisons with the next frame: S_0 = c_0, S_(t+1) = S_t f_t / c_t.
+
+    Args:
+        current: Variance of each frame over its overlap with the next.
+        following: Variance of the next frame over the same.
+    """
+    ratios = following[:-1] / current[:-1]
+    return current[0] * np.cumprod(np.concatenate([[1.0], ratios]))
+
+
+def reconciled(
+    own: Float64[np.ndarray, "m"], comparisons: Sequence[Comparison], *, anchor: float
+) -> Float64[np.ndarray, "m"]:
+    """Scores that agree best with all comparisons, by least squares on their logarithms.
+
+    Args:
+        own: Variance of each whole picture: a faint hint, without which the scale were free.
+        comparisons: Of any pairs of frames.
+        anchor: How much that hint counts against a comparison of whole pictures.
+    """
+    system, right = np.diag(np.full(len(own), anchor)), anchor * np.log(own + TINY)
+    for pair in comparisons:
+        if pair.share < LEAST_SHARE or min(pair.first, pair.second) <= 0:
+            continue
+        ratio = np.log(pair.second / pair.first)
+        ends = [pair.i, pair.j]
+        system[ends, ends] += pair.share
+        system[ends, ends[::-1]] -= pair.share
+        right[ends] += pair.share * ratio * np.array([-1, 1])
+    return np.exp(np.linalg.solve(system, right))
+
+
+def window_weights(
+    scores: Float64[np.ndarray, "m"], *, length: int = WINDOW, stride: int = STRIDE
+) -> Float64[np.ndarray, "m"]:
+    """Scores over the mean of those around: windows overlap, and their weights are averaged.
+
+    Args:
+        scores: Of frames in order of time.
+        length: Frames in a window; the last may have fewer.
+        stride: From one window to the next.
+    """
+    total, times = np.zeros(len(scores)), np.zeros(len(scores))
+    first = 0
+    while first < len(scores):
+        part = slice(first, first + length)
+        total[part] += scores[part] / scores[part].mean()
+        times[part] += 1
+        if first + length >= len(scores):
+            break
+        first += stride
+    return total / np.maximum(times, 1)
