@@ -1,6 +1,6 @@
 """How fast event cameras' files are read, and how much memory that takes.
 
-    python -m benchmarks.decode [--events 20] [--runs 3] [--samples ../shared/data/prophesee]
+    python -m benchmarks.decode [--events 8] [--runs 3] [--samples ../shared/data/prophesee]
 
 Real recordings of Prophesee's sensors, repeated with time going on until there are that many
 million events; EVT2.1 and DAT hold the events of the EVT2 recording. Each reader runs in a process
@@ -124,7 +124,7 @@ def make(samples: Path, folder: Path, millions: float) -> None:
 def main() -> None:
     """Run, print and save."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--events", type=float, default=20.0, help="millions of events per file")
+    parser.add_argument("--events", type=float, default=8.0, help="millions of events per file")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--samples", type=Path, default=Path("../shared/data/prophesee"))
     asked = parser.parse_args()
