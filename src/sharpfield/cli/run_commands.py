@@ -37,6 +37,8 @@ class Choice:
     them. Left out, they follow the capture and the machine."""
     use: tuple[str, ...] = ("frames", "events")
     """Streams of the capture to learn from."""
+    block: str = ""
+    """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
     change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
     """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
 
@@ -70,7 +72,8 @@ def train(
     source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
-    started = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
+    where_from, given = str(capture.resolve()), reading.given()
+    started = Started(recipe, made, where_from, seed, choice.use, given, choice.block)
     ledger = start(started, source, out, options, device=where, console=console)
     if ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.", highlight=False)

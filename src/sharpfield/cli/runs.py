@@ -9,6 +9,7 @@ import torch
 from rich.console import Console
 from rich.progress import Progress
 
+from sharpfield.captures.blocks import blocks_of, limited, parsed
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
@@ -64,7 +65,7 @@ class Opened:
     started: Started
     model: Any
     capture: Capture
-    """All of it, also what the model did not use."""
+    """All of it, or its block; also what the model did not use."""
 
     @property
     def seen(self) -> Capture:
@@ -105,6 +106,14 @@ def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
     return capture.without(frames="frames" not in left, events="events" not in left)
 
 
+def part_of(capture: Capture, block: str) -> Capture:
+    """The block of a capture that "2/4" names; all of it if nothing does."""
+    if not block:
+        return capture
+    index, count = parsed(block)
+    return limited(capture, blocks_of(capture, count)[index])
+
+
 def start(
     started: Started,
     capture: Capture,
@@ -115,7 +124,7 @@ def start(
     console: Console,
 ) -> Ledger:
     """Train a recipe on a capture in a run folder, or go on with it."""
-    chosen = used(capture, started.use)
+    chosen = used(part_of(capture, started.block), started.use)
 
     def build(steps: int) -> Model:
         return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
@@ -155,7 +164,7 @@ def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") ->
             got=source,
             do="say where it is now with --capture",
         )
-    whole = read(source, **started.reading)
+    whole = part_of(read(source, **started.reading), started.block)
     model = started.recipe.lasting(ledger.planned_steps).build(
         used(whole, started.use), started.seed
     )

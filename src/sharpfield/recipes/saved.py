@@ -30,6 +30,8 @@ class Started:
     """Which streams of the capture were used."""
     reading: dict[str, Any] = field(default_factory=dict)
     """How the capture was read, where its layout was not believed: options of `captures.read`."""
+    block: str = ""
+    """Which part of a long capture it was trained on, "2/4"; "" for all of it."""
 
     def settings(self) -> dict[str, Any]:
         """As JSON; the length of the schedule is the run's own."""
@@ -39,6 +41,7 @@ class Started:
             "seed": self.seed,
             "use": list(self.use),
             "reading": self.reading,
+            **({"block": self.block} if self.block else {}),
             "options": dataclasses.asdict(self.recipe),
         }
 
@@ -66,6 +69,7 @@ def read_started(run: Path) -> Started:
             int(table["seed"]),
             tuple(table["use"]),
             dict(table.get("reading", {})),
+            table.get("block", ""),
         )
     except FileNotFoundError:
         raise RunError(

@@ -1,0 +1,105 @@
+"""The command that trains a long capture in blocks: here, or shared out by torchrun."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+from tyro.conf import Positional
+
+from sharpfield.captures.blocks import blocks_of
+from sharpfield.captures.read import read
+from sharpfield.cli.run_commands import CHOICE, OPTIONS, READING, Choice, Device, changed
+from sharpfield.cli.runs import Reading, device_named, open_run, start
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.merge import merge
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.saved import Started, write_started
+from sharpfield.training import Ledger, Options, adam, read_ledger
+from sharpfield.training.checkpoint import Progress, save_last
+from sharpfield.training.record import write_ledger
+
+FOLDER = "blocks"
+"""Of the runs of the blocks, in the run they make together."""
+
+
+def blocks(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    count: int = 2,
+    seed: int = 0,
+    device: Device = "auto",
+    choice: Choice = CHOICE,
+    options: Options = OPTIONS,
+    reading: Reading = READING,
+) -> None:
+    """Train a long capture in overlapping blocks, and merge them into one run.
+
+    The same command goes on where an earlier one stopped. To train blocks side by side, start it by
+    torchrun, which restarts workers that die:
+    `torchrun --nproc-per-node 2 --max-restarts 3 --no-python sharpfield blocks ...`.
+
+    Args:
+        recipe: One of those made of Gaussians, such as room-splat.
+        capture: Folder of the capture.
+        out: Folder of the merged run; the blocks' own runs are in it.
+        count: How many blocks.
+        seed: Of everything random.
+        device: Where to train.
+        choice: Presets, streams, single numbers.
+        options: How long, how often to save, how much memory; for each block.
+        reading: What to believe instead of the capture's layout.
+    """
+    if choice.block:
+        raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
+    console, where = Console(), device_named(device)
+    source = read(capture, **reading.given())
+    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = changed(made, choice.change)
+    whole = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
+    runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
+    for i in _mine(count, os.environ):
+        block = replace(whole, block=f"{i + 1}/{count}")
+        done = read_ledger(runs[i])
+        if done is not None and done.finished:
+            continue
+        console.print(f"Block {block.block}", highlight=False)
+        going_on = replace(options, resume=options.resume or done is not None)
+        start(block, source, runs[i], going_on, device=where, console=console)
+    ledgers = [read_ledger(run) for run in runs]
+    if all(ledger is not None and ledger.finished for ledger in ledgers):
+        _merge(whole, source, out, runs, [ledger for ledger in ledgers if ledger is not None])
+        console.print(f"Merged. `sharpfield evaluate {out}` measures it.", highlight=False)
+
+
+def _mine(count: int, environment: Mapping[str, str]) -> range:
+    """The blocks of this process, as torchrun numbers processes; all if it did not start it."""
+    rank, world = int(environment.get("RANK", 0)), int(environment.get("WORLD_SIZE", 1))
+    return range(rank, count, world)
+
+
+def _merge(
+    whole: Started, source: Capture, out: Path, runs: list[Path], ledgers: list[Ledger]
+) -> None:
+    """Write the merged run: what all workers that get here write is the same."""
+    models = [open_run(run, device="cpu").model for run in runs]
+    merged = merge(models, blocks_of(source, len(runs)))
+    steps = max(ledger.planned_steps for ledger in ledgers)
+    write_started(out, whole)
+    progress = Progress(steps, steps, settings=whole.settings())
+    save_last(out, merged, adam(merged), progress)
+    write_ledger(
+        out,
+        Ledger(
+            steps,
+            1,
+            ledgers[0].device,
+            steps,
+            sum(ledger.seconds for ledger in ledgers),
+            max(ledger.peak_memory_mb for ledger in ledgers),
+        ),
+    )
