@@ -17,8 +17,10 @@ from sharpfield.preparation.ingest import Ingested, ingest
 from sharpfield.preparation.ingest_choices import Choices, Cleaning, Crop, Scene, Timing
 from sharpfield.preparation.ingest_lens import Optics
 from sharpfield.preparation.ingest_stage import Stage
+from sharpfield.recordings.aedat4_writer import write_aedat4
 from sharpfield.recordings.open import Told, open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers
+from sharpfield.recordings.ros1_bag_writer import write_ros1_bag
 from sharpfield.simulation import EventSensor, Rig, simulate
 from sharpfield.simulation import Timing as Exposures
 from sharpfield.storage import exporting_events
@@ -82,6 +84,15 @@ def write_rpg(path: Path, events: EventStream) -> None:
             file.write(f"{t / 1e6:.6f} {x} {y} {int(p > 0)}\n")
 
 
+def write_dv(path: Path, events: EventStream) -> None:
+    write_aedat4(path, of_arrays(events, [])[0], packing="none")
+
+
+def write_bag(path: Path, events: EventStream) -> None:
+    pytest.importorskip("rosbags")
+    write_ros1_bag(path, of_arrays(events, [])[0])
+
+
 def export(path: Path, events: EventStream) -> None:
     with exporting_events(path, events[:0]) as append:
         append(events)
@@ -95,6 +106,8 @@ CONTAINERS: dict[str, tuple[Callable[[Path, EventStream], None], Told]] = {
     "dsec.h5": (write_dsec, Told(size=SIZE)),
     "mvsec.h5": (write_mvsec, Told(size=SIZE)),
     "vid2e": (write_vid2e, Told(size=SIZE)),
+    "dv.aedat4": (write_dv, Told()),
+    "ros.bag": (write_bag, Told()),
     "rpg": (write_rpg, Told(size=SIZE)),
 }
 
@@ -147,6 +160,26 @@ def test_the_same_capture_from_every_container(truth, tmp_path, container):
     np.testing.assert_array_equal(frames.exposure.close_us, truth.needed_frames.exposure.close_us)
     assert (made.events, made.frames, made.left_out) == (len(truth.needed_events), 8, {})
     assert set(made.unknown) == {"poses", "intrinsics", "bounds"}
+
+
+@pytest.mark.parametrize("container", ["dv.aedat4", "ros.bag"])
+def test_frames_and_events_of_one_file(truth, tmp_path, container):
+    events, frames = of_arrays(truth.needed_events, in_memory(truth))
+    both = replace(events, frames=frames.frames)
+    if container == "ros.bag":
+        pytest.importorskip("rosbags")
+        write_ros1_bag(tmp_path / container, both)
+    else:
+        write_aedat4(tmp_path / container, both, packing="none")
+    recording = open_recording(tmp_path / container)
+    made = ingest((recording,), tmp_path / "capture", SAME, hush)
+    found = native.read_unposed(tmp_path / "capture")
+    assert made.left_out == {}
+    np.testing.assert_array_equal(found.needed_events.t_us, truth.needed_events.t_us)
+    np.testing.assert_array_equal(found.needed_frames.images, truth.needed_frames.images)
+    exposure = truth.needed_frames.exposure
+    np.testing.assert_array_equal(found.needed_frames.exposure.open_us, exposure.open_us)
+    np.testing.assert_array_equal(found.needed_frames.exposure.close_us, exposure.close_us)
 
 
 def test_what_was_ingested_waits_for_its_poses(truth, tmp_path):

@@ -94,7 +94,8 @@ def read_calibration(path: Path, *, size: tuple[int, int] | None = None) -> Cali
     cameras = {
         name: _kalibr(about, f"{path}, {name}", size)
         for name, about in (held.items() if isinstance(held, Mapping) else ())
-        if isinstance(about, Mapping) and ("intrinsics" in about or _dsec_like(about))
+        if isinstance(about, Mapping)
+        and ("intrinsics" in about or isinstance(about.get("camera_matrix"), list))
     }
     if cameras:
         return Calibration(cameras, _chain(found, list(cameras), path))
@@ -138,12 +139,6 @@ def seen_from(
     xy = real.project(torch.where(behind[..., None], torch.ones_like(direction), direction))
     xy[behind] = -1e4
     return (xy - HALF).float().numpy()
-
-
-def _dsec_like(about: Mapping[str, Any]) -> bool:
-    """Whether `camera_matrix` is four numbers: fx, fy, cx, cy."""
-    matrix = about.get("camera_matrix")
-    return isinstance(matrix, Sequence) and len(matrix) == 4
 
 
 def _kalibr(about: Mapping[str, Any], where: str, size: tuple[int, int] | None) -> Camera:

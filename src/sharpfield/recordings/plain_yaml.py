@@ -116,7 +116,7 @@ class _Parser:
     def _value(self, rest: str, line: tuple[int, int, str], depth: int) -> Any:
         """What follows a key or a dash: on the same line, or on deeper ones."""
         rest = TAG.sub("", rest)
-        if rest[:1] in ("&", "*", "|", ">"):
+        if rest[:1] in ("&", "*", "|", ">", "]", "}"):
             raise self.refused(line)
         if rest[:1] in ("[", "{"):
             tokens = TOKEN.findall(rest)

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.open import FORMATS, Told, format_of, open_events, open_recording
+from sharpfield.storage import write_events
+from sharpfield.storage.images import write_image
+from tests.streams import HEIGHT, WIDTH, random_events
+
+
+@pytest.mark.parametrize(
+    ("name", "layout", "told", "count", "span"),
+    [
+        ("prophesee/evt2_sample.raw", "evt", {"size": (640, 480)}, 539_481, 50_000),
+        ("prophesee/evt3_sample.raw", "evt", {}, 219_596, 8_801),
+        ("prophesee/sample_ncars.dat", "dat", {"size": (304, 240)}, 2_009, 99_952),
+        ("inivation/davis346_sample.aedat4", "aedat4", {}, 6_676, 169_941),
+        (
+            "inivation/mnist_0_scale04_0001.aedat",
+            "aedat2",
+            {"size": (128, 128)},
+            15_744,
+            None,
+        ),
+        ("ros/test_events_1.bag", "rosbag", {}, 343_474, 2_078_178),
+        ("ros/test_events_1", "rosbag", {}, 343_474, 2_078_178),
+        ("ros/test_events_2", "rosbag", {}, None, None),
+        ("ecd_tubrip/boxes_rotation", "rpg-folder", {"size": (240, 180)}, 30_000, 13_279),
+        ("ecd_tubrip/boxes_rotation/events.txt", "text", {"size": (240, 180)}, 30_000, 13_279),
+        (
+            "ecd_tubrip/boxes_rotation/events.npy",
+            "npy",
+            {"size": (240, 180), "unit": "s"},
+            29_158,
+            13_279,
+        ),
+        (
+            "ncaltech_nmnist/faces_easy_0001.bin",
+            "nmnist",
+            {"size": (304, 240)},
+            67_445,
+            None,
+        ),
+        (
+            "blender/atelier/events.h5",
+            "hdf5",
+            {"size": (300, 200), "unit": "ns"},
+            1_820_374,
+            1_199_560,
+        ),
+    ],
+)
+def test_every_sample_is_recognised_by_what_is_in_it(samples, name, layout, told, count, span):
+    path = samples / name
+    assert format_of(path) == layout
+    found = open_recording(path, Told(**told)).load()
+    assert count is None or len(found) == count
+    assert span is None or found.t_us[-1] - found.t_us[0] == span
+
+
+def test_samples_without_events(samples):
+    assert format_of(samples / "slider_depth_noevents") == "pictures"
+    assert format_of(samples / "video" / "vid2e_seq1.mp4") == "video"
+
+
+def test_the_name_of_a_file_is_not_believed(tmp_path):
+    write_events(tmp_path / "events.raw", random_events(50))
+    assert format_of(tmp_path / "events.raw") == "hdf5"
+    assert len(open_events(tmp_path / "events.raw").load()) == 50
+
+
+def test_every_format_says_what_it_takes():
+    for name, known in FORMATS.items():
+        assert set(known.takes) <= set(vars(Told())), name
+        assert known.holds and known.marks, name
+
+
+# Questions
+
+
+def test_what_fits_no_format(tmp_path):
+    (tmp_path / "a.xyz").write_bytes(b"\x00\x01\x02")
+    with pytest.raises(CaptureError, match="no known format") as caught:
+        open_recording(tmp_path / "a.xyz")
+    assert "3 bytes" in str(caught.value) and "AER-DAT4" in str(caught.value)
+    with pytest.raises(CaptureError, match="recording not found"):
+        open_recording(tmp_path / "b.raw")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CaptureError, match="an empty folder"):
+        open_recording(tmp_path / "empty")
+
+
+def test_what_fits_several_formats(tmp_path):
+    (tmp_path / "metadata.yaml").write_text("")
+    (tmp_path / "events.txt").write_text("")
+    with pytest.raises(CaptureError, match="several formats fit") as caught:
+        open_recording(tmp_path)
+    assert "choose a layout: rosbag, rpg-folder" in str(caught.value)
+
+
+def test_what_does_not_belong_to_the_format(tmp_path):
+    write_events(tmp_path / "e.h5", random_events(5))
+    with pytest.raises(OptionError, match="the format hdf5 has no option columns") as caught:
+        open_recording(tmp_path / "e.h5", Told(columns="xytp"))
+    assert "it belongs to" in str(caught.value) and "npy" in str(caught.value)
+    with pytest.raises(OptionError, match="unknown format"):
+        open_recording(tmp_path / "e.h5", layout="evt9")
+    write_image(tmp_path / "p" / "0.png", np.zeros((HEIGHT, WIDTH, 1), np.uint8))
+    with pytest.raises(CaptureError, match="nothing says when"):
+        open_events(tmp_path / "p")
