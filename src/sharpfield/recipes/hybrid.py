@@ -22,8 +22,7 @@ from sharpfield.formation.patch_kernel import (
     LearnedKernel,
     motion_kernels,
 )
-from sharpfield.metrics.quality import quality
-from sharpfield.recipes.frame_weights import frame_weights
+from sharpfield.metrics.quality import quality, quality_weights
 from sharpfield.recipes.hybrid_checkpoint import load_released
 from sharpfield.recipes.image_sources import SourceOptions
 from sharpfield.recipes.picture_branch import PictureBranch
@@ -170,6 +169,6 @@ def quality_of(
     if kind == "published":
         found = quality(capture, way="published").weights
     else:
-        found = frame_weights(capture, kind)
+        found = quality_weights(capture, source=kind)[capture.split.train]
     weight[capture.split.train] = found / found.mean()
     return weight
