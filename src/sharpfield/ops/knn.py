@@ -11,6 +11,7 @@ batch, keeps a random choice of points where a cell is full, and stops at the fi
 enough; here neighbours are those that are truly nearest in the window.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -20,11 +21,11 @@ from torch import Tensor
 from sharpfield.core.errors import OptionError
 from sharpfield.ops._dispatch import Op
 
-SIDE = 4
-"""Cells along the edge of a brick."""
+HALF, BITS = 2, 6
+"""Bits of one coordinate of a cell inside its brick, and of all three."""
 
-BRICK = SIDE**3
-"""Cells of a brick."""
+SIDE, BRICK = 1 << HALF, 1 << BITS
+"""Cells along the edge of a brick, and in it."""
 
 MOST_BRICKS = 1 << 28
 """Of the table: 1 GiB."""
@@ -71,6 +72,7 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
     low = points.amin(0) - (reach + 0.5) * edge
     cell = ((points - low) / edge).floor().long()
     bricks = [(int(most) + reach) // SIDE + 1 for most in cell.amax(0)]
+    assert 0 <= reach <= SIDE, f"windows reach at most one brick further, not {reach} cells"
     if bricks[0] * bricks[1] * bricks[2] > MOST_BRICKS:
         extent = (points.amax(0) - points.amin(0)).tolist()
         raise OptionError(
@@ -82,23 +84,24 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
     key = _key(cell, bricks)
     key, order = key.sort(stable=True)
     held, count = torch.unique_consecutive(key, return_counts=True)
-    keys = [held] if reach == 0 else [_key(c, bricks) for c in _around(held, bricks, reach)]
+    cell = _cell_of_key(held, bricks)
     marked = torch.zeros(bricks[0] * bricks[1] * bricks[2], dtype=torch.bool, device=key.device)
-    for one in keys:
-        marked[one // BRICK] = True
-    number = torch.where(marked, marked.cumsum(0) - 1, -1)
+    for step in itertools.product(sorted({-reach, reach}), repeat=3):
+        marked[_key(cell + cell.new_tensor(step), bricks) >> BITS] = True
+    number = torch.where(marked, marked.cumsum(0, dtype=torch.int32) - 1, -1).int()
     cells = int(marked.sum()) * BRICK
     near = torch.zeros(cells, dtype=torch.bool, device=key.device)
-    for one in keys:
-        near[number[one // BRICK] * BRICK + one % BRICK] = True
+    for step in window(reach):  # one after the other: together they would be many
+        one = _key(cell + cell.new_tensor(step), bricks)
+        near[number[one >> BITS].long() * BRICK + (one & BRICK - 1)] = True
     counts = torch.zeros(cells + 1, dtype=torch.int64, device=key.device)
-    counts[number[held // BRICK] * BRICK + held % BRICK + 1] = count
+    counts[number[held >> BITS].long() * BRICK + (held & BRICK - 1) + 1] = count
     x, y, z = low.tolist()
     return Cells(
         origin=(x, y, z),
         edge=edge,
         reach=reach,
-        table=number.int().view(*bricks),
+        table=number.view(*bricks),
         start=counts.cumsum(0).int(),
         near=near,
         order=order,
@@ -213,22 +216,21 @@ def chosen(
 
 def _key(cell: Int64[Tensor, "n 3"], bricks: list[int]) -> Int64[Tensor, "n"]:
     """One number for each cell, brick after brick."""
-    x, y, z = (cell // SIDE).unbind(-1)
+    x, y, z = (cell >> HALF).unbind(-1)
     brick = (x * bricks[1] + y) * bricks[2] + z
-    x, y, z = (cell % SIDE).unbind(-1)
-    return brick * BRICK + (x * SIDE + y) * SIDE + z
+    x, y, z = (cell & SIDE - 1).unbind(-1)
+    return brick << BITS | x << 2 * HALF | y << HALF | z
 
 
-def _around(key: Int64[Tensor, "n"], bricks: list[int], reach: int) -> list[Int64[Tensor, "n 3"]]:
-    """The cells around some, one list for each step of the window."""
-    brick, inner = key // BRICK, key % BRICK
+def _cell_of_key(key: Int64[Tensor, "n"], bricks: list[int]) -> Int64[Tensor, "n 3"]:
+    """The inverse of `_key`."""
+    brick, inner = key >> BITS, key & BRICK - 1
     at = [
-        brick // (bricks[1] * bricks[2]) * SIDE + inner // SIDE**2,
-        brick // bricks[2] % bricks[1] * SIDE + inner // SIDE % SIDE,
-        brick % bricks[2] * SIDE + inner % SIDE,
+        brick // (bricks[1] * bricks[2]) << HALF | inner >> 2 * HALF,
+        brick // bricks[2] % bricks[1] << HALF | inner >> HALF & SIDE - 1,
+        brick % bricks[2] << HALF | inner & SIDE - 1,
     ]
-    cell = torch.stack(at, -1)
-    return [cell + cell.new_tensor(step) for step in window(reach)]
+    return torch.stack(at, -1)
 
 
 def _cell_of(places: Float[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
@@ -241,8 +243,8 @@ def _number(cell: Int64[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
     bricks = list(cells.table.shape)
     inside = ((cell >= 0) & (cell < SIDE * cell.new_tensor(bricks))).all(-1)
     key = _key(torch.where(inside[..., None], cell, 0).reshape(-1, 3), bricks).view(inside.shape)
-    brick = cells.table.flatten()[key // BRICK].long()
-    return torch.where(inside & (brick >= 0), brick * BRICK + key % BRICK, -1)
+    brick = cells.table.flatten()[key >> BITS].long()
+    return torch.where(inside & (brick >= 0), brick * BRICK + (key & BRICK - 1), -1)
 
 
 def _nearest(
