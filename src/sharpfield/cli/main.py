@@ -9,6 +9,7 @@ from sharpfield.cli.calibrate_command import calibrate
 from sharpfield.cli.blocks_command import blocks
 from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
+from sharpfield.cli.doctor_command import doctor
 from sharpfield.cli.event_commands import events
 from sharpfield.cli.export_command import export
 from sharpfield.cli.ingest_command import ingest
@@ -27,6 +28,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "deblur": deblur,
     "quality": quality,
     "blur": blur,
+    "doctor": doctor,
     "poses": poses,
     "calibrate": calibrate,
     "train": train,
