@@ -22,6 +22,8 @@ ROOM = (6.0, 5.0)
 """Width (x) and depth (z) of the room."""
 FLOOR, CEILING = 1.5, -1.1
 """y of both."""
+BEYOND = 0.4
+"""How much larger walls are than the room."""
 NEAR, FAR = 0.3, 7.5
 """Depths that contain everything seen on the walk."""
 
@@ -38,8 +40,10 @@ def room() -> Scene:
 
 def _shell() -> list[Surface]:
     """Floor, ceiling, four walls, and what hangs on them."""
-    width, depth = ROOM
-    height, middle = FLOOR - CEILING, (FLOOR + CEILING) / 2
+    middle = (FLOOR + CEILING) / 2
+    # Walls go on behind each other, so that no light comes in where they meet.
+    width, depth = ROOM[0] + BEYOND, ROOM[1] + BEYOND
+    height = FLOOR - CEILING + BEYOND
     brick = Paint("#b5573f", "#d98d62", "#e8dccb", BRICKS, 2.2)
     paper = Paint("#e9e0cc", "#b9c7a5", "#d08a6a", LEAVES, 3.4, 5)
     stripes = Paint("#dfe6ea", "#a9bfd0", "#ffffff", STRIPES, 5.0)
@@ -47,15 +51,19 @@ def _shell() -> list[Surface]:
     floor = Paint("#8a5a34", "#b98552", texture=WOOD, cells=2.2, seed=3)
     ceiling = Paint("#f1eee6", "#dcd6c8", "#cfc4ae", TILES, 1.6, 7)
     walls = [
-        rectangle((0, middle, depth / 2), (width, height), brick, throws_shadow=False),
+        rectangle((0, middle, ROOM[1] / 2), (width, height), brick, throws_shadow=False),
         rectangle(
-            (0, middle, -depth / 2), (width, height), paper, turn=(0, 180, 0), throws_shadow=False
+            (0, middle, -ROOM[1] / 2), (width, height), paper, turn=(0, 180, 0), throws_shadow=False
         ),
         rectangle(
-            (width / 2, middle, 0), (depth, height), plaster, turn=(0, 90, 0), throws_shadow=False
+            (ROOM[0] / 2, middle, 0), (depth, height), plaster, turn=(0, 90, 0), throws_shadow=False
         ),
         rectangle(
-            (-width / 2, middle, 0), (depth, height), stripes, turn=(0, -90, 0), throws_shadow=False
+            (-ROOM[0] / 2, middle, 0),
+            (depth, height),
+            stripes,
+            turn=(0, -90, 0),
+            throws_shadow=False,
         ),
         rectangle((0, FLOOR, 0), (width, depth), floor, turn=FLAT, throws_shadow=False),
         rectangle((0, CEILING, 0), (width, depth), ceiling, turn=FLAT, throws_shadow=False),

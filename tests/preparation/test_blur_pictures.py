@@ -1,0 +1,46 @@
+import json
+
+import numpy as np
+import pytest
+
+from sharpfield.captures.images import read_image, write_image
+from sharpfield.core import CaptureError
+from sharpfield.preparation.blur_pictures import blur_pictures
+from sharpfield.simulation.motion_kernel import KernelRange
+
+
+@pytest.fixture
+def folder(tmp_path):
+    draw = np.random.default_rng(0)
+    for i in range(6):
+        write_image(tmp_path / "in" / f"p{i}.png", draw.integers(0, 256, (20, 30, 3), np.uint8))
+    return tmp_path / "in"
+
+
+def test_names_and_sizes_stay_and_sharp_ones_are_copied(folder, tmp_path):
+    half = KernelRange(probability=0.5)
+    rows = blur_pictures(folder, tmp_path / "out", ranges=half, seed=2)
+    told = json.loads((tmp_path / "out" / "blur.json").read_text())
+    assert told["pictures"] == rows and told["k"] == [3, 16] and told["probability"] == 0.5
+    assert 0 < sum(row["blurred"] for row in rows) < 6
+    for row in rows:
+        before, after = (read_image(place / row["name"]) for place in (folder, tmp_path / "out"))
+        assert before.shape == after.shape
+        assert np.array_equal(before, after) is not row["blurred"]
+        assert not row["blurred"] or 3 <= row["k"] < 16
+    assert blur_pictures(folder, tmp_path / "out", ranges=half, seed=2) == rows
+
+
+def test_nothing_is_left_when_a_picture_cannot_be_read(folder, tmp_path):
+    (folder / "p9.png").write_bytes(b"not a picture")
+    with pytest.raises(CaptureError, match="cannot decode image"):
+        blur_pictures(folder, tmp_path / "out", ranges=KernelRange(probability=1.0))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
+
+
+def test_other_folders_are_not_replaced(folder, tmp_path):
+    with pytest.raises(CaptureError, match="will not replace what is not a folder of blurred"):
+        blur_pictures(folder, folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(CaptureError, match="there are no pictures"):
+        blur_pictures(tmp_path / "empty", tmp_path / "out")
