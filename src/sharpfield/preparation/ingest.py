@@ -23,9 +23,9 @@ from sharpfield.core.files import replacing
 from sharpfield.core.frames import Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import Stamped, Still
-from sharpfield.preparation.ingest_choices import Choices
+from sharpfield.preparation.ingest_choices import Choices, roles
 from sharpfield.preparation.ingest_clock import (
-    Offset,
+    believed,
     find_offset,
     shifted,
     triggered,
@@ -75,7 +75,7 @@ def ingest(recordings: tuple[Recording, ...], out: Path, choices: Choices, tell:
         CaptureError: A recording is unsound, or something is not known and must be given.
         OptionError: Choices do not fit each other.
     """
-    events, frames = _roles(recordings)
+    events, frames = roles(recordings)
     plan = {
         "files": [fingerprint(recording.path) for recording in recordings],
         "layouts": [recording.layout for recording in recordings],
@@ -108,7 +108,7 @@ class _Ingest:
         exposure, clock = self._exposure(taken, found) if taken is not None else (None, "")
         span = self._span(found, exposure)
         sieve = self._write_events(found, lens, span) if found is not None else None
-        left = self._left | ({} if sieve is None else _sifted(sieve))
+        left = self._left | ({} if sieve is None else sieve.left_out())
         if taken is not None and exposure is not None:
             taken, exposure, dropped = self._crop(taken, exposure, span)
             left |= dropped
@@ -116,7 +116,9 @@ class _Ingest:
         notes = self._notes(lens, sieve, left, clock)
         self._seal(replace(capture, notes=notes), taken)
         return Ingested(
-            events=0 if found is None or sieve is None else found.count - _removed(sieve),
+            events=0
+            if found is None or sieve is None
+            else found.count - sum(sieve.left_out().values()),
             frames=0 if taken is None else len(taken.names),
             span_us=span,
             left_out=left,
@@ -212,7 +214,7 @@ class _Ingest:
         if timing.clock == "triggers":
             raise CaptureError("the recording holds no triggers", where=self._where)
         offset = find_offset(taken.change, exposure.middle_us, found.per_ms, found.origin_us)
-        return shifted(exposure, _believed(offset, self._where)), f"frames came later by {offset}"
+        return shifted(exposure, believed(offset, self._where)), f"frames came later by {offset}"
 
     def _span(self, found: Survey | None, exposure: Exposure | None) -> tuple[int, int]:
         """First and last time of the capture."""
@@ -390,47 +392,3 @@ class _Ingest:
             ]
         native.describe(capture, self._stage.capture, frames=tables)
         self._stage.finish()
-
-
-def _roles(
-    recordings: tuple[Recording, ...],
-) -> tuple[Recording | None, Recording | None]:
-    """Which recording gives the events, and which the frames."""
-    with_events = [one for one in recordings if one.events is not None]
-    with_frames = [one for one in recordings if one.frames is not None]
-    if len(recordings) not in (1, 2) or not (with_events or with_frames):
-        raise OptionError("give one recording, or two", got=len(recordings))
-    if len(with_events) > 1 or (len(recordings) > 1 and not with_events):
-        raise OptionError(
-            "of two recordings one must give the events and the other the frames",
-            got=" and ".join(f"{one.path} ({one.layout})" for one in recordings),
-        )
-    events = with_events[0] if with_events else None
-    others = [one for one in with_frames if one is not events]
-    frames = others[0] if others else with_frames[0] if with_frames else None
-    return events, frames
-
-
-def _believed(offset: Offset, where: object) -> int:
-    """The offset, if it is certain; none at all if none fits as well."""
-    if not offset.certain:
-        raise CaptureError(
-            "cannot tell how the clocks of frames and events are related",
-            where=where,
-            got=f"the best offset is {offset}",
-            do="give --offset-ms, or --clock same if both were on one clock",
-        )
-    return 0 if abs(offset.offset_us) <= offset.within_us else offset.offset_us
-
-
-def _sifted(sieve: Sieve) -> dict[str, int]:
-    found = {
-        "events of hot pixels": sieve.of_hot,
-        "lonely events": sieve.lonely,
-        "events outside the time to keep": sieve.outside,
-    }
-    return {kind: count for kind, count in found.items() if count}
-
-
-def _removed(sieve: Sieve) -> int:
-    return sieve.of_hot + sieve.lonely + sieve.outside

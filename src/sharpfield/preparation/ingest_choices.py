@@ -4,8 +4,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from sharpfield.core.errors import OptionError
 from sharpfield.preparation.ingest_clock import Stamp
 from sharpfield.preparation.ingest_lens import Optics
+from sharpfield.recordings.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -73,3 +75,26 @@ class Choices:
     crop: Crop = field(default_factory=Crop)
     timing: Timing = field(default_factory=Timing)
     scene: Scene = field(default_factory=Scene)
+
+
+def roles(
+    recordings: tuple[Recording, ...],
+) -> tuple[Recording | None, Recording | None]:
+    """Which recording gives the events, and which the frames.
+
+    Raises:
+        OptionError: There are too many, or both give the same.
+    """
+    with_events = [one for one in recordings if one.events is not None]
+    with_frames = [one for one in recordings if one.frames is not None]
+    if len(recordings) not in (1, 2) or not (with_events or with_frames):
+        raise OptionError("give one recording, or two", got=len(recordings))
+    if len(with_events) > 1 or (len(recordings) > 1 and not with_events):
+        raise OptionError(
+            "of two recordings one must give the events and the other the frames",
+            got=" and ".join(f"{one.path} ({one.layout})" for one in recordings),
+        )
+    events = with_events[0] if with_events else None
+    others = [one for one in with_frames if one is not events]
+    frames = others[0] if others else with_frames[0] if with_frames else None
+    return events, frames

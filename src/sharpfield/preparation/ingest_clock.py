@@ -183,6 +183,22 @@ def find_offset(
     )
 
 
+def believed(offset: Offset, where: object) -> int:
+    """The offset in us, if it is certain; 0 if the clocks may as well be the same.
+
+    Raises:
+        CaptureError: It is not certain.
+    """
+    if not offset.certain:
+        raise CaptureError(
+            "cannot tell how the clocks of frames and events are related",
+            where=where,
+            got=f"the best offset is {offset}",
+            do="give --offset-ms, or --clock same if both were on one clock",
+        )
+    return 0 if abs(offset.offset_us) <= offset.within_us else offset.offset_us
+
+
 def shifted(exposure: Exposure, offset_us: int) -> Exposure:
     """The same exposures on another clock."""
     return replace(

@@ -77,7 +77,7 @@ class Geometry:
         if bayer and image.ndim == 2:
             image = cv2.cvtColor(image, DEMOSAIC[bayer])
         if self.frame_map is not None:
-            image = cv2.remap(image, self.frame_map, None, cv2.INTER_LINEAR)
+            image = cv2.remap(image, *cv2.split(self.frame_map), interpolation=cv2.INTER_LINEAR)
         elif self.frame_size is not None:
             image = cv2.resize(image, self.frame_size, interpolation=cv2.INTER_AREA)
         return image if image.ndim == 3 else image[..., None]

@@ -91,11 +91,10 @@ class Stage:
         if not path.is_file():
             return None
         found = load_arrays(path)
-        return Survey(
-            *(int(found[name]) for name in ("count", "brighter", "first_us", "last_us")),
-            found["per_pixel"],
-            found["per_ms"],
+        count, brighter, first_us, last_us = (
+            int(found[name]) for name in ("count", "brighter", "first_us", "last_us")
         )
+        return Survey(count, brighter, first_us, last_us, found["per_pixel"], found["per_ms"])
 
     def write(
         self, parts: Iterator[EventStream], like: EventStream, span_us: tuple[int, int]
@@ -173,7 +172,8 @@ def plain(options: Any) -> Any:
 
 def _count(path: Path) -> int:
     with h5py.File(path, "r") as file:
-        return len(file["events/t"])
+        times: Any = file["events/t"]
+        return len(times)
 
 
 def _after(parts: Iterator[EventStream], done: int) -> Iterator[EventStream]:

@@ -145,6 +145,20 @@ class Sieve:
             inside = chosen(inside, keep)
         return inside
 
+    @property
+    def taken(self) -> int:
+        """How many events were taken out so far."""
+        return self.of_hot + self.lonely + self.outside
+
+    def left_out(self) -> dict[str, int]:
+        """How many events were left out so far, by reason."""
+        found = {
+            "events of hot pixels": self.of_hot,
+            "lonely events": self.lonely,
+            "events outside the time to keep": self.outside,
+        }
+        return {kind: count for kind, count in found.items() if count}
+
 
 def chosen(events: EventStream, keep: Shaped[np.ndarray, "n"]) -> EventStream:
     """Some of the events of one camera, copied."""

@@ -68,7 +68,7 @@ class Dialect:
         group = file.get(before.rstrip("/"))
         if not isinstance(group, h5py.Group):
             return []
-        return [name for name in group if self._holds(file.get(f"{before}{name}/{after}"))]
+        return [str(name) for name in group if self._holds(file.get(f"{before}{name}/{after}"))]
 
     def at(self, camera: str) -> str:
         """Path of the events of a camera."""
@@ -162,7 +162,7 @@ def _event_file(
 ) -> EventFile:
     with ExitStack() as resources:
         file = resources.enter_context(_opened(path))
-        held = file[dialect.at(camera)]
+        held: Any = file[dialect.at(camera)]
         if dialect.table:
             expect_filled(held, f"{path}, {held.name}")
             order = dialect.columns[0]
@@ -191,7 +191,7 @@ def _event_file(
 
 
 def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
-    column = group[name]
+    column: Any = group[name]
     if isinstance(column, h5py.Dataset) and column.ndim == 1 and column.dtype.kind in "iufb":
         expect_filled(column, f"{path}, {column.name}")
         return column
@@ -255,15 +255,17 @@ def _mvsec_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
 
 
 def _mvsec_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
-    images, times = (file[f"davis/{camera}/{name}"] for name in ("image_raw", "image_raw_ts"))
+    sensor: Any = file[f"davis/{camera}"]
+    images, times = sensor["image_raw"], sensor["image_raw_ts"]
     times_us = whole_us(times[:], "s", file.filename)
     for image, t_us in zip(images, times_us.tolist(), strict=False):
         yield Frame(image, t_us, t_us)
 
 
 def _numbered_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
-    for name in sorted(file["images"]):
-        image = file["images"][name]
+    images: Any = file["images"]
+    for name in sorted(images):
+        image = images[name]
         stamp = np.asarray(image.attrs.get("timestamp", np.nan), np.float64).reshape(-1)[:1]
         t_us = int(whole_us(stamp, "s", f"{file.filename}, images/{name}")[0])
         yield Frame(image[:], t_us, t_us, name)

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import Int64, Shaped
 
 from sharpfield.core.errors import CaptureError, OptionError
@@ -127,7 +128,7 @@ def _decoded(path: Path, interval_us: float | None, trouble: Trouble) -> Iterato
                     t_us = round(frame.pts * frame.time_base * 1_000_000)
                 yield Frame(_pixels(frame), t_us, t_us, f"{count:06d}")
                 count += 1
-    except av.FFmpegError as error:
+    except FFmpegError as error:
         if not count:
             raise CaptureError(
                 "not a video that can be decoded", where=path, got=error, do="convert it again"

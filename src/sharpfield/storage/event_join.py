@@ -7,6 +7,7 @@ is interrupted. The parts are joined without unpacking them: HDF5 chunks are cop
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -27,7 +28,7 @@ def join_events(path: Path, parts: Sequence[Path]) -> None:
             `span_us`; all but the last hold a multiple of `event_writer.ROWS` events.
     """
     with ExitStack() as opened:
-        files = [opened.enter_context(h5py.File(part, "r")) for part in parts]
+        files: list[Any] = [opened.enter_context(h5py.File(part, "r")) for part in parts]
         counts = [len(file["events/t"]) for file in files]
         assert not any(count % ROWS for count in counts[:-1]), f"parts of {counts} events"
         temporary = opened.enter_context(replacing(path))
@@ -35,7 +36,7 @@ def join_events(path: Path, parts: Sequence[Path]) -> None:
             joined.attrs.update(files[0].attrs)
             joined.create_group("events")
             for name in files[0]["events"]:
-                _join_column(joined, [file["events"][name] for file in files])
+                _join_column(joined, name, [file["events"][name] for file in files])
             for name in set(files[0]) - {"events", MARKS}:
                 files[0].copy(name, joined)
             joined.create_dataset(
@@ -43,14 +44,14 @@ def join_events(path: Path, parts: Sequence[Path]) -> None:
             )
 
 
-def _join_column(joined: h5py.File, columns: Sequence[h5py.Dataset]) -> None:
+def _join_column(joined: h5py.File, name: str, columns: Sequence[h5py.Dataset]) -> None:
     first = columns[0]
     total = sum(len(column) for column in columns)
     space = h5py.h5s.create_simple((total,), (h5py.h5s.UNLIMITED,))
     packing = first.id.get_create_plist()  # chunks and filters, as they were packed
     made = h5py.h5d.create(
         joined["events"].id,
-        first.name.rpartition("/")[2].encode(),
+        name.encode(),
         first.id.get_type(),
         space,
         packing,
@@ -64,7 +65,7 @@ def _join_column(joined: h5py.File, columns: Sequence[h5py.Dataset]) -> None:
         base += len(column)
 
 
-def _marks(files: Sequence[h5py.File], counts: Sequence[int]) -> UInt64[np.ndarray, "m"]:
+def _marks(files: Sequence[Any], counts: Sequence[int]) -> UInt64[np.ndarray, "m"]:
     """Number of the first event at or after each ms: each part tells it for its own time."""
     known, base = [np.empty(0, np.uint64)], 0
     for file, count in zip(files, counts, strict=True):
