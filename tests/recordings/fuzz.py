@@ -103,7 +103,7 @@ def campaign(name: str, *, files: int, folder: Path, seed: int = 0) -> Counter[s
             outcomes[check(case.open, path, case=case)] += 1
         except Exception as error:
             kept = path.replace(folder / f"failed-{name}-{number}{case.suffix}")
-            raise AssertionError(f"{name}, seed {number}, {kept}: {error!r}") from error
+            raise AssertionError(f"{name}, seed {number}, {kept}: {error!r:.300}") from error
         finally:
             faulthandler.cancel_dump_traceback_later()
     return outcomes

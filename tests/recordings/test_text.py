@@ -138,6 +138,15 @@ def test_archives_hold_one_text(tmp_path: Path) -> None:
         open_davis(path)
 
 
+def test_an_archive_whose_names_are_damaged(tmp_path: Path) -> None:
+    data = bytearray(zipped(rpg_lines(3)))
+    data[7], data[30] = 0x08, 0xFF  # the name is UTF-8, it says, and is not
+    path = tmp_path / "a.zip"
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match="cannot read the archive"):
+        open_davis(path)
+
+
 @pytest.mark.parametrize("block", [13, 64])
 def test_blocks_may_be_cut_anywhere(
     block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

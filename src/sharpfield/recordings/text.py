@@ -13,6 +13,7 @@ Source: Mueggler et al., *The event-camera dataset and simulator* (IJRR 2017); H
 """
 
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
@@ -61,7 +62,10 @@ WHOLE_HEAD, LONGEST = 2**16, 2**12
 BAD_LINES, BAD_SHARE = 100, 0.01
 """More unreadable lines than this, and than this share of all, mean that it is no such text."""
 
-UNREADABLE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError)
+UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError),
+    *(KeyError, ValueError, NotImplementedError, RuntimeError),
+)
 """What an archive that is damaged, locked or packed in an odd way raises."""
 
 Blocks = Callable[[], Iterator[bytes]]
