@@ -149,7 +149,7 @@ def test_weights_are_of_all_frames_and_say_nothing_about_held_out_ones(
     found = by_events if source == "auto" else by_depth
     np.testing.assert_array_equal(weights[walked.split.test], 1)
     np.testing.assert_allclose(weights[walked.split.train], found.weights)
-    assert weights.shape == (21,) and found.weights.mean() == pytest.approx(1, abs=0.1)
+    assert weights.shape == (21,) and found.weights.mean() == pytest.approx(1, abs=0.2)
 
 
 def test_the_published_way_is_the_chain_of_neighbours(walked):
