@@ -183,7 +183,7 @@ def _story(made: Ingested, out: Path) -> Iterator[str]:
     if made.unknown:
         yield f"  not known yet: {', '.join(made.unknown)}"
     if "poses" in made.unknown:
-        yield f"next: sharpfield doctor {out}, then sharpfield poses {out}"
+        yield f"next: sharpfield doctor {out}, then sharpfield poses {out} --out {out}-posed"
 
 
 @contextmanager
