@@ -43,7 +43,7 @@ def motion_kernels(
         distances: How far strokes reach from the pixel.
         kind: Where they begin.
     """
-    kernels = []
+    kernels: list[Tensor] = []
     if kind in ("outward", "both"):
         kernels += [_stroke(size, m, 0, 45 * turn) for m in distances for turn in range(8)]
     if kind in ("through", "both"):

@@ -74,7 +74,7 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
     bricks = [(int(most) + reach) // SIDE + 1 for most in cell.amax(0)]
     assert 0 <= reach <= SIDE, f"windows reach at most one brick further, not {reach} cells"
     if bricks[0] * bricks[1] * bricks[2] > MOST_BRICKS:
-        extent = (points.amax(0) - points.amin(0)).tolist()
+        extent = points.amax(0) - points.amin(0)
         raise OptionError(
             "points are spread too far for cells so small",
             got=f"{len(points)} points over {extent[0]:.3g} x {extent[1]:.3g} x {extent[2]:.3g}"
@@ -83,7 +83,11 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
         )
     key = _key(cell, bricks)
     key, order = key.sort(stable=True)
-    held, count = torch.unique_consecutive(key, return_counts=True)
+    changed = torch.ones_like(key, dtype=torch.bool)
+    changed[1:] = key[1:] != key[:-1]
+    first = torch.nonzero(changed)[:, 0]
+    held = key[first]
+    count = torch.cat([first, first.new_tensor([len(key)])]).diff()
     cell = _cell_of_key(held, bricks)
     marked = torch.zeros(bricks[0] * bricks[1] * bricks[2], dtype=torch.bool, device=key.device)
     for step in itertools.product(sorted({-reach, reach}), repeat=3):
@@ -96,9 +100,8 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
         near[number[one >> BITS].long() * BRICK + (one & BRICK - 1)] = True
     counts = torch.zeros(cells + 1, dtype=torch.int64, device=key.device)
     counts[number[held >> BITS].long() * BRICK + (held & BRICK - 1) + 1] = count
-    x, y, z = low.tolist()
     return Cells(
-        origin=(x, y, z),
+        origin=(float(low[0]), float(low[1]), float(low[2])),
         edge=edge,
         reach=reach,
         table=number.view(*bricks),
@@ -137,7 +140,9 @@ def neighbours(
         Rows of the points, near to far, -1 where there are no more; and the way from the query to
         each of them, zero where there is none.
     """
-    parts = [_nearest(part, cells, most, radius) for part in queries.detach().split(CHUNK)]
+    begins = range(0, len(queries), CHUNK)
+    detached = queries.detach()
+    parts = [_nearest(detached[i : i + CHUNK], cells, most, radius) for i in begins]
     rows = torch.cat(parts) if parts else queries.new_zeros(0, most, dtype=torch.int64)
     return rows, ways(queries, points, rows)
 

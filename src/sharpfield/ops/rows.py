@@ -21,14 +21,14 @@ def take_rows(table: Float[Tensor, "n f"], rows: Int64[Tensor, "m"]) -> Float[Te
         table: Of any length.
         rows: Ascending, without repetition, see `compact`.
     """
-    apply: Callable[..., Tensor] = _TakeRows.apply  # pyright: ignore[reportUnknownMemberType]
+    apply: Callable[..., Tensor] = _TakeRows.apply  # pyright: ignore
     return apply(table, rows)
 
 
 def compact(rows: Int64[Tensor, "*b"]) -> tuple[Int64[Tensor, "m"], Int64[Tensor, "*b"]]:
     """The rows that occur, ascending and once each, and where in that list each one is."""
-    taken, place = torch.unique(rows, return_inverse=True)
-    return taken, place
+    unique: Callable[..., tuple[Tensor, Tensor]] = torch.unique  # pyright: ignore
+    return unique(rows, return_inverse=True)
 
 
 class _TakeRows(torch.autograd.Function):
@@ -44,7 +44,7 @@ class _TakeRows(torch.autograd.Function):
         ctx: Any, *gradients: Tensor
     ) -> tuple[Tensor, None]:
         (rows,) = ctx.saved_tensors
-        sparse = torch.sparse_coo_tensor(
-            rows[None], gradients[0], ctx.shape, is_coalesced=True, check_invariants=False
-        )
-        return sparse, None
+        sparse: Callable[..., Tensor] = torch.sparse_coo_tensor  # pyright: ignore
+        shape = ctx.shape
+        taken = sparse(rows[None], gradients[0], shape, is_coalesced=True, check_invariants=False)
+        return taken, None

@@ -166,7 +166,8 @@ class PointModel(nn.Module):
         made = generator(self.seed, step, "alone")
         mixed = torch.randperm(len(seen), generator=made).to(seen.device)
         alone = int(len(seen) * self.pictures.options.drop)
-        return {"frames": seen[mixed[alone:]]} | ({"alone": seen[mixed[:alone]]} if alone else {})
+        batch: Batch = {"frames": seen[mixed[alone:]]}
+        return batch | {"alone": seen[mixed[:alone]]} if alone else batch
 
     def losses(self, batch: Batch, step: int) -> Terms:
         """Error of the pixels whose rays met a point, and indecision of the points."""
