@@ -2,15 +2,16 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures.blocks import blocks_of
 from sharpfield.captures.read import read
-from sharpfield.cli.run_commands import CHOICE, OPTIONS, READING, Choice, Device, changed
+from sharpfield.cli.run_commands import OPTIONS, READING, Choice, Device, changed
 from sharpfield.cli.runs import Reading, device_named, open_run, start
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -26,14 +27,24 @@ FOLDER = "blocks"
 """Of the runs of the blocks, in the run they make together."""
 
 
+@dataclass(frozen=True)
+class Cut(Choice):
+    """What of the recipe, and of the capture, is used, and in how many blocks."""
+
+    count: int = 2
+    """Blocks that the capture is cut into."""
+
+
+CUT = Cut()
+
+
 def blocks(
     recipe: Positional[str],
     capture: Positional[Path],
     out: Path,
-    count: int = 2,
     seed: int = 0,
     device: Device = "auto",
-    choice: Choice = CHOICE,
+    choice: Cut = CUT,
     options: Options = OPTIONS,
     reading: Reading = READING,
 ) -> None:
@@ -47,16 +58,15 @@ def blocks(
         recipe: One of those made of Gaussians, such as room-splat.
         capture: Folder of the capture.
         out: Folder of the merged run; the blocks' own runs are in it.
-        count: How many blocks.
         seed: Of everything random.
         device: Where to train.
-        choice: Presets, streams, single numbers.
+        choice: Presets, streams, single numbers, blocks.
         options: How long, how often to save, how much memory; for each block.
         reading: What to believe instead of the capture's layout.
     """
     if choice.block:
         raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
-    console, where = Console(), device_named(device)
+    console, where, count = Console(), device_named(device), choice.count
     source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
@@ -87,7 +97,7 @@ def _merge(
 ) -> None:
     """Write the merged run: what all workers that get here write is the same."""
     models = [open_run(run, device="cpu").model for run in runs]
-    merged = merge(models, blocks_of(source, len(runs)))
+    merged: Any = merge(models, blocks_of(source, len(runs)))
     steps = max(ledger.planned_steps for ledger in ledgers)
     write_started(out, whole)
     progress = Progress(steps, steps, settings=whole.settings())

@@ -9,6 +9,7 @@ only events), as long as both have the same clock.
 """
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,15 +28,19 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
 from sharpfield.evaluation.device import device_of
 from sharpfield.evaluation.event_scores import event_scores
+from sharpfield.evaluation.more_scores import aligned_psnr, depth_error, distances
 from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.reference import Reference, held_out, trained_on
-from sharpfield.evaluation.scores import NAMES, mean, score
+from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
 from sharpfield.metrics import Lpips, laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX
-from sharpfield.rendering.view import CHUNK, Progress, render_view, renderer_of
+from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, render_view, renderer_of
 
 METRICS = "metrics.json"
+
+TRACE = 1e-3
+"""Least opacity that depth is divided by."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,7 @@ class View:
     light: Float[Tensor, "h w c"]
     """Linear, as the model gives it."""
     depth: Float[Tensor, "h w"]
+    opacity: Float[Tensor, "h w"]
     seconds: float
 
 
@@ -119,6 +125,7 @@ def evaluate(
     }
     if (events := event_scores(model, capture)) is not None:
         metrics["events"] = events
+    metrics["mean"] |= _more(model, capture, test_views, brightness, events)
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
     with replacing(run / METRICS) as temporary:
@@ -166,7 +173,7 @@ def _render(
             got=f"{int((~seen.rgb.isfinite()).sum())} of {seen.rgb.numel()} values",
             do="train again, or evaluate an earlier checkpoint",
         )
-    return View(reference, seen.rgb, seen.depth, perf_counter() - begun)
+    return View(reference, seen.rgb, seen.depth, seen.opacity, perf_counter() - begun)
 
 
 def _brightness(model: Model, views: list[View], how: Measuring) -> Brightness:
@@ -208,6 +215,38 @@ def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path
         "image": f"renders/{folder.name}/{name}.png",
         "depth": f"renders/{folder.name}/{name}_depth.png",
     }
+
+
+def _more(
+    model: Model,
+    capture: Capture,
+    views: list[View],
+    brightness: Brightness,
+    events: Mapping[str, Any] | None,
+) -> dict[str, float]:
+    """What else the truth allows to measure on held-out views."""
+    found: dict[str, float] = {}
+    if events is not None:
+        longest = max(events["lengths"], key=float)
+        scores = events["lengths"][longest]
+        found |= {name: scores[name] for name in ("event_psnr", "event_mae")}
+    pairs = [(view.light, image) for view in views if (image := view.reference.image) is not None]
+    if pairs and capture.events is not None:
+        found["psnr_aligned"] = math.fsum(
+            aligned_psnr(brightness.picture(light), brightness.reference(image), HIGHEST_PSNR)
+            for light, image in pairs
+        ) / len(pairs)
+    frames = capture.frames
+    if frames is not None and frames.depth is not None and views:
+        whole = isinstance(renderer_of(model), ViewRenderer)
+        truth = [frames.depth[view.reference.frame] for view in views]
+        if not whole:
+            truth = [distances(one, capture.camera) for one in truth]
+        drawn = [v.depth if whole else v.depth / v.opacity.clamp_min(TRACE) for v in views]
+        error = depth_error(drawn, [view.opacity for view in views], truth)
+        if error is not None:
+            found["depth_error"] = error
+    return found
 
 
 def _summary(

@@ -10,6 +10,7 @@ import torch
 
 import sharpfield
 from sharpfield.core.capture import Capture
+from sharpfield.evaluation import more_scores
 from sharpfield.evaluation.reference import Reference
 from sharpfield.evaluation.scores import DEFINITIONS
 from sharpfield.metrics import Lpips
@@ -48,6 +49,7 @@ def describe(
         "domain": "display (as stored), 0...1; renders clamped, not quantised",
         "averaging": "mean over views of the number of each view",
         **DEFINITIONS,
+        **more_scores.DEFINITIONS,
         "lpips": _lpips(lpips, too_small),
         "pose_refinement": "none",
         "versions": {
