@@ -152,7 +152,7 @@ def find_offset(
     until = np.concatenate([[0], np.cumsum(per_ms)]).astype(np.float64)
     skipped = max(len(change) - MOST, 0) // 2
     change, middles_us = change[skipped : skipped + MOST], middles_us[skipped : skipped + MOST + 1]
-    ms = (middles_us - middles_us[0]) // 1000
+    ms = (middles_us - middles_us[0] + 500) // 1000
     interval = max(int(np.median(np.diff(ms))), 1)
     step = max(interval // STEPS, 1)
     fewest = max(FEWEST, int(HALF * len(change)))
