@@ -85,6 +85,7 @@ def evaluate(
     device: Device = "auto",
     refine: bool = False,
     refinement: Refinement = REFINEMENT,
+    train_views: int | None = None,
     lpips_backbone: Path | None = None,
     lpips_linear: Path | None = None,
 ) -> None:
@@ -96,6 +97,7 @@ def evaluate(
         device: Where to render.
         refine: Refine the held-out poses first, with the scene frozen.
         refinement: How, if so.
+        train_views: Most training views to render as well; by default all whose truth is known.
         lpips_backbone: Weights file of torchvision's AlexNet or VGG16, to compute LPIPS.
         lpips_linear: Weights file of LPIPS's own linear layers.
     """
@@ -109,7 +111,7 @@ def evaluate(
     if refine:
         found = refine_poses(opened.model, opened.capture, how=refinement)
         poses, stated = found.poses, {**stated, **found.protocol}
-    measuring = Measuring(lpips=lpips, poses=poses, stated=stated)
+    measuring = Measuring(train_views=train_views, lpips=lpips, poses=poses, stated=stated)
     metrics = measure(opened, run, console, measuring=measuring)
     mean = {name: value for name, value in metrics["mean"].items() if value is not None}
     console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()), highlight=False)
