@@ -43,7 +43,7 @@ def test_the_best_offset_is_that_of_a_slow_search():
     per_ms = activity(2)
     middles_us, change = seen(per_ms, 40_000, noise=0.3)
     until = np.concatenate([[0], np.cumsum(per_ms)])
-    ms = (middles_us - middles_us[0]) // 1000
+    ms = (middles_us - middles_us[0] + 500) // 1000
     best = max(
         range(len(per_ms) - int(ms[-1]) + 1),
         key=lambda o: np.corrcoef(np.diff(until[ms + o]), change)[0, 1],
