@@ -14,8 +14,10 @@ from sharpfield.preparation.doctor_findings import Checkup, Curve, Finding
 
 LOOK = Look(900, 82)
 INK = {"error": "#c2281a", "warning": "#b8801f", "note": "#5f6b7a"}
-WIDTH, HEIGHT, MARGIN = 460, 200, 42
+WIDTH, HEIGHT, MARGIN = 300, 170, 40
 """Of a drawing, and the room for its numbers."""
+WIDE = 1.9
+"""Width over height from which on a picture gets a row of its own."""
 
 
 def write_page(path: Path, checkup: Checkup, capture: Capture | None) -> None:
@@ -78,7 +80,10 @@ def _pictures(checkup: Checkup) -> str:
         )
         for caption, pixels in checkup.pictures.items()
     ]
-    return f'<div class="row">{"".join(figures)}</div>' if figures else ""
+    wide = [pixels.shape[1] > WIDE * pixels.shape[0] for pixels in checkup.pictures.values()]
+    small = "".join(one for one, alone in zip(figures, wide, strict=True) if not alone)
+    large = "".join(one for one, alone in zip(figures, wide, strict=True) if alone)
+    return f'<div class="row">{small}</div>{large}' if figures else ""
 
 
 def _curves(checkup: Checkup) -> str:

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 
 import tyro
 
-from sharpfield.cli.calibrate_command import calibrate
 from sharpfield.cli.blocks_command import blocks
+from sharpfield.cli.calibrate_command import calibrate
 from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
 from sharpfield.cli.doctor_command import doctor

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +21,6 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.files import replacing
 from sharpfield.preparation.poses_external import Mount, attach, known_at
 from sharpfield.preparation.poses_find import PoseOptions, find_poses
-from sharpfield.preparation.poses_pictures import sharp_pictures
 from sharpfield.preparation.poses_report import as_text, summary
 
 FINDING = PoseOptions()
@@ -62,9 +62,7 @@ def poses(
         return
     known = None
     if align is not None:
-        path = read_path(align, layout)
-        sharp = sharp_pictures(original, options.pictures, instants=options.instants)
-        known = known_at(path, mount, sharp.time_us)
+        known = partial(known_at, read_path(align, layout), mount)
     found = find_poses(original, options, known=known)
     native.write(replace(found.capture, name=out.name), out)
     about = summary(original, found)

@@ -149,7 +149,7 @@ class _Equations:
 
     index: EventIndex
     pairs: list[ExposurePair]
-    sites: list[Int64[np.ndarray, "k"]]
+    sites: list[Int64[np.ndarray, "_"]]
     """That have an equation, of each pair."""
     seen: Float64[np.ndarray, "e"]
     """What the frames say."""

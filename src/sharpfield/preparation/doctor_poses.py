@@ -19,10 +19,10 @@ from sharpfield.preparation.doctor_findings import Checkup, Curve
 from sharpfield.preparation.poses_pictures import Sharp, sharp_pictures
 from sharpfield.preparation.views import PairMatches, find_details, match_pairs, sampson_px
 
-MOST_PICTURES = 10
+MOST_PICTURES = 8
 LEAST_DETAILS = 60
 """Matches over all pairs; fewer do not judge."""
-FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 57))
+FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 33))
 """Focal lengths tried, relative to the one given."""
 OFF_BY, GAIN = 0.06, 0.75
 """Another focal length is right if it differs so much and leaves so small a part of the error."""
@@ -70,9 +70,9 @@ def check_pictures(capture: Capture, checkup: Checkup) -> None:
     )
     if matches:
         most = max(matches, key=len)
-        checkup.pictures["details that two frames share, and the lines the poses say"] = _lines(
-            sharp.pictures[rows], most, capture.camera, poses
-        )
+        checkup.pictures[
+            "details that two frames share: green on the lines that poses say, else red"
+        ] = _lines(sharp.pictures[rows], most, capture.camera, poses)
     got = f"median {given:.2f} px from the lines, {count} details of {len(matches)} pairs"
     off = abs(np.log(FACTORS[best])) > OFF_BY
     if given > FINE_PX and off and errors[best] < GAIN * given and errors[best] < POOR_PX:

@@ -142,7 +142,7 @@ def _events_posed(capture: Capture, checkup: Checkup) -> bool:
     if events is None or known is None or not len(events):
         return True
     first, last = np.searchsorted(events.t_us, (known[0], known[1] + 1))
-    outside = 1 - (last - first) / len(events)
+    outside = 1 - float(last - first) / len(events)
     if outside > OUTSIDE:
         severity = "error" if capture.frames is None or outside > 0.3 else "warning"
         checkup.say(

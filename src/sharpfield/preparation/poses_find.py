@@ -7,6 +7,7 @@ are neither learned from nor held out; frames beyond the path's ends are left ou
 events beyond them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,9 @@ from sharpfield.preparation.poses_path import Laid, path_through
 from sharpfield.preparation.poses_pictures import Sharp, Source, sharp_pictures
 from sharpfield.preparation.poses_space import Known, depths, known_world, measured_world, own_world
 
+INSTANTS, MOST_PICTURES = 3, 120
+"""Pictures taken from each exposure, as long as there are not more in all."""
+
 LEAST_SHARE = 0.5
 """Share of the pictures that must be found for the result to be worth writing."""
 
@@ -46,6 +50,10 @@ BOUNDS_MARGIN = 1.1
 """Near and far are these percentiles of the depth of all sightings, and a margin."""
 
 
+KnownAt = Callable[[Int64[np.ndarray, "n"]], Known]
+"""Gives the poses that something else says for some times of the capture, in us."""
+
+
 @dataclass(frozen=True)
 class PoseOptions:
     """How poses are found."""
@@ -53,8 +61,9 @@ class PoseOptions:
     pictures: Source = "auto"
     """`edi`: frames deblurred with their events. `frames`: as they are. `sharpest`: only the
     sharpest of each three neighbours. `auto`: `edi` where there are events and exposures."""
-    instants: int = 1
-    """Pictures taken from each exposure, with `edi`; more make the path finer, and take longer."""
+    instants: int | None = None
+    """Pictures taken from each exposure, with `edi`; more make the path finer, and take longer.
+    By default three, or fewer where that would be more than 120 pictures."""
     intrinsics: Intrinsics | None = None
     """`given` keeps the camera, `refine` starts from its focal length, `find` knows nothing; by
     default `given`, or `find` where the capture does not know its focal length."""
@@ -90,19 +99,23 @@ class PosesFound:
     """Root mean square distance of camera centres from known ones."""
 
 
-def find_poses(capture: Capture, options: PoseOptions, *, known: Known | None = None) -> PosesFound:
+def find_poses(
+    capture: Capture, options: PoseOptions, *, known: KnownAt | None = None
+) -> PosesFound:
     """The capture with poses, points, depth bounds and, if they were unknown, intrinsics.
 
     Args:
         capture: With frames. Poses it has are not looked at.
         options: Pictures, lens.
-        known: Poses of the pictures from elsewhere, which then say what the world is.
+        known: Says poses at some times of the capture, and thereby what the world is.
 
     Raises:
         CaptureError: Poses could not be found; the message says why and what to try.
         MissingExtra: pycolmap is not installed.
     """
-    sharp = sharp_pictures(capture, options.pictures, instants=options.instants)
+    sharp = sharp_pictures(
+        capture, options.pictures, instants=options.instants or _instants(capture, options.pictures)
+    )
     intrinsics = options.intrinsics or _usual(capture)
     task = LensTask(capture.camera, intrinsics, options.lens)
     found, seen = map_pictures(sharp.pictures, task, seed=options.seed)
@@ -110,7 +123,7 @@ def find_poses(capture: Capture, options: PoseOptions, *, known: Known | None = 
         raise _hopeless(capture, sharp, found, seen)
     off = None
     if known is not None:
-        change, off = known_world(found, known)
+        change, off = known_world(found, known(sharp.time_us))
     elif capture.depth is not None:
         change = measured_world(found, capture, sharp.frame)
     else:
@@ -141,6 +154,14 @@ def within(events: EventStream, path: Stamped | Still | Tracks, laid: Laid) -> E
     if not spans:
         return events
     return events.window(min(s[0] for s in spans), max(s[1] for s in spans) + 1)
+
+
+def _instants(capture: Capture, source: Source) -> int:
+    """Pictures to take from each exposure: the motion during long ones is no straight line."""
+    blurred = int((~capture.needed_frames.exposure.instant).sum())
+    if capture.events is None or not blurred or source not in ("auto", "edi"):
+        return 1
+    return max(min(INSTANTS, MOST_PICTURES // blurred), 1)
 
 
 def _usual(capture: Capture) -> Intrinsics:
