@@ -114,7 +114,7 @@ def test_comparing_says_how_the_twin_agrees(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--out", "x.raw"), "unknown format of events"),
+        (("--out", "x.bin"), "unknown format of events"),
         (("--out", "x.h5", "--sensor", "eye"), "unknown sensor"),
         (("--out", "x.h5", "--view", 3), "no such view"),
         (("--out", "x.h5", "--from", 50, "--to", 20), "the window of time is empty"),
