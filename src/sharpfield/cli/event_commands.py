@@ -119,7 +119,7 @@ def events(
 
     Args:
         run: Folder that `train` made.
-        out: The file, FILE.h5, FILE.npz or FILE.csv.
+        out: The file, FILE.h5, FILE.raw, FILE.npz or FILE.csv.
         place: Camera, path, time.
         pixels: Sensor and steps of time.
         extra: Event frames, comparison.
