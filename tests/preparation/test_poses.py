@@ -11,6 +11,7 @@ import torch
 
 from sharpfield.captures import native, read
 from sharpfield.captures.pose_layouts import OuterPath
+from sharpfield.cli.poses_command import Elsewhere
 from sharpfield.cli.poses_command import poses as poses_command
 from sharpfield.core import Capture, CaptureError, OptionError
 from sharpfield.core.errors import MissingExtra
@@ -220,7 +221,9 @@ def test_command_attaches_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[s
     native.write(unposed(fast()), tmp_path / "bare")
     np.savez(tmp_path / "path.npz", times_us=path.times_us, poses=path.poses)
     poses_command(
-        tmp_path / "bare", tmp_path / "posed", trajectory=tmp_path / "path.npz", bounds=(2.0, 8.0)
+        tmp_path / "bare",
+        tmp_path / "posed",
+        elsewhere=Elsewhere(trajectory=tmp_path / "path.npz", bounds=(2.0, 8.0)),
     )
     assert "7 of 7 frames" in capsys.readouterr().out
     assert read(tmp_path / "posed").near == 2.0

@@ -247,7 +247,7 @@ def _from_quaternions(
 def _orthonormal(poses: Float64[np.ndarray, "p 3 4"]) -> Float64[np.ndarray, "p 3 4"]:
     """The nearest rotations: files round to six digits. Anything farther off is left to fail."""
     u, singular, vt = np.linalg.svd(poses[:, :, :3])
-    near = (np.abs(singular - 1) < UNIT_LENGTH).all(-1)[:, None, None]
+    near = (np.abs(singular - 1).max(-1) < UNIT_LENGTH)[:, None, None]
     rotation = np.where(near, u @ vt, poses[:, :, :3])
     return np.concatenate([rotation, poses[:, :, 3:]], -1)
 

@@ -1,7 +1,7 @@
 """`sharpfield poses`: find where the camera was, or attach what something else says of it."""
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -23,46 +23,64 @@ from sharpfield.preparation.poses_external import Mount, attach, known_at
 from sharpfield.preparation.poses_find import PoseOptions, find_poses
 from sharpfield.preparation.poses_report import as_text, summary
 
-FINDING = PoseOptions()
 REPORT, PAGE = "poses.json", "poses.html"
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Poses that another program, a tracker or an encoder knows."""
+
+    trajectory: Path | None = None
+    """A file of poses to take instead of finding them."""
+    align: Path | None = None
+    """A file of poses whose world the poses found are to be brought into."""
+    layout: PathLayout | None = None
+    """Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap."""
+    offset_ms: float = 0.0
+    """Added to the times of that file."""
+    hand_eye: Path | None = None
+    """Where the camera sits on the body the file tracks: a matrix, or x y z qx qy qz qw."""
+    bounds: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
+    """Nearest and farthest depth, with --trajectory, where the frames do not show them."""
+
+    def __post_init__(self) -> None:
+        if self.trajectory is not None and self.align is not None:
+            raise OptionError(
+                "give either --trajectory or --align", got=f"{self.trajectory} and {self.align}"
+            )
+
+    def mount(self) -> Mount:
+        """How the body and the clock of the file relate to the camera's."""
+        hand = None if self.hand_eye is None else read_hand_eye(self.hand_eye)
+        return Mount(round(1000 * self.offset_ms), hand)
+
+
+FINDING, ELSEWHERE = PoseOptions(), Elsewhere()
 
 
 def poses(
     capture: Positional[Path],
     out: Path,
-    trajectory: Path | None = None,
-    align: Path | None = None,
-    layout: PathLayout | None = None,
-    offset_ms: float = 0.0,
-    hand_eye: Path | None = None,
-    bounds: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None,
     options: PoseOptions = FINDING,
+    elsewhere: Elsewhere = ELSEWHERE,
 ) -> None:
     """Find where the camera was from the frames, deblurred with the events, or attach known poses.
 
     Args:
         capture: Folder of the capture; poses it has are not looked at.
         out: Folder of the new capture, with `poses.json` and `poses.html`.
-        trajectory: A file of poses to take instead of finding them.
-        align: A file of poses whose world the poses found are to be brought into.
-        layout: Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap.
-        offset_ms: Added to the times of that file.
-        hand_eye: Where the camera sits on the body the file tracks (a matrix, or x y z qx qy qz
-            qw).
-        bounds: Nearest and farthest depth, with --trajectory, where the frames do not show them.
         options: Pictures, lens.
+        elsewhere: Poses from a file.
     """
-    if trajectory is not None and align is not None:
-        raise OptionError("give either --trajectory or --align", got=f"{trajectory} and {align}")
     expect_replaceable(out, native.recognise)
-    original = read_unposed(capture)
-    mount = Mount(round(1000 * offset_ms), None if hand_eye is None else read_hand_eye(hand_eye))
-    if trajectory is not None:
-        _attach(original, read_path(trajectory, layout), mount, bounds, out)
+    original, mount = read_unposed(capture), elsewhere.mount()
+    if elsewhere.trajectory is not None:
+        path = read_path(elsewhere.trajectory, elsewhere.layout)
+        _attach(original, path, mount, elsewhere.bounds, out)
         return
     known = None
-    if align is not None:
-        known = partial(known_at, read_path(align, layout), mount)
+    if elsewhere.align is not None:
+        known = partial(known_at, read_path(elsewhere.align, elsewhere.layout), mount)
     found = find_poses(original, options, known=known)
     native.write(replace(found.capture, name=out.name), out)
     about = summary(original, found)
@@ -85,7 +103,7 @@ def _attach(
     attached = attach(original, path, mount, bounds=bounds)
     made = attached.capture
     native.write(replace(made, name=out.name), out)
-    names = () if original.frames is None else original.frames.names
+    names: tuple[str, ...] = () if original.frames is None else original.frames.names
     lost = [names[i] for i in np.setdiff1d(np.arange(len(names)), attached.kept)]
     about = {
         "capture": original.name,

@@ -34,7 +34,7 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
             "test": len(made.split.test),
             "left_out": [names[i] for i in range(len(names)) if i not in found.kept],
         },
-        "error_px": _rounded(np.nanmean(mapped.error_px), 3),
+        "error_px": _rounded(float(np.nanmean(mapped.error_px)), 3),
         "points": {
             "map": len(mapped.points),
             "kept": 0 if made.points is None else len(made.points),
