@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-NAMES = ("ops", "rasterize", "event_simulator", "training_step", "render_view", "gpu")
+NAMES = ("ops", "rasterize", "neighbours", "event_simulator", "training_step", "render_view", "gpu")
 
 
 def main() -> None:

@@ -1,0 +1,129 @@
+"""Recipes for rooms on one walk, with the same time each; and the studies of the hybrid's paper.
+
+    python -m benchmarks.rooms [--study recipes|weights|capacity|points] [--minutes 6]
+
+Without a capture (`--capture FOLDER`) the room is simulated: 120 frames of 240x180, 75 % blurred.
+`weights` compares frames weighted by quality with frames that all count alike; `capacity` gives the
+networks more points and wider descriptors; `points` takes fewer and noisier ones.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.table import Row, save, show
+from sharpfield.captures import native, read
+from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.run_commands import changed
+from sharpfield.cli.runs import measure, open_run, start
+from sharpfield.core.capture import Capture
+from sharpfield.evaluation import Measuring
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.saved import Started
+from sharpfield.simulation import ROOM_RIG, RoomTiming, simulate_room
+from sharpfield.training import Options
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A recipe with some of its numbers changed."""
+
+    recipe: str
+    preset: str = "draft"
+    changes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """In the table."""
+        return " ".join([self.recipe, *([self.preset] if self.preset != "draft" else [])])
+
+
+H = "h-only,draft"
+MORE, WIDER = "cloud.budget=200000", "sizes.channels=32"
+FEW, NOISY = "cloud.budget=10000", "cloud.noise=0.05"
+
+STUDIES = {
+    "recipes": (
+        Contender("point-nerf"),
+        Contender("hybrid", H),
+        Contender("hybrid"),
+        Contender("splat"),
+        Contender("room-splat"),
+    ),
+    "weights": (
+        Contender("hybrid"),
+        Contender("hybrid", changes=("quality=even",)),
+        Contender("room-splat"),
+        Contender("room-splat", changes=("looks.quality=even",)),
+    ),
+    "capacity": (
+        Contender("point-nerf"),
+        Contender("point-nerf", changes=(MORE,)),
+        Contender("point-nerf", changes=(WIDER,)),
+        Contender("hybrid", H),
+    ),
+    "points": tuple(
+        Contender(recipe, preset, changes)
+        for changes in ((), (FEW,), (NOISY,))
+        for recipe, preset in (("point-nerf", "draft"), ("hybrid", H))
+    ),
+}
+
+
+def main() -> None:
+    """Run, print and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--study", choices=STUDIES, default="recipes")
+    parser.add_argument("--capture", type=Path)
+    parser.add_argument("--frames", type=int, default=120)
+    parser.add_argument("--size", default="240x180")
+    parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--out", type=Path, default=Path("runs/rooms"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cpu")
+    asked = parser.parse_args()
+    out = asked.out / asked.study
+    source = asked.capture or out / "capture"
+    if not source.exists():
+        rig = replace(ROOM_RIG, size=parse_size(asked.size))
+        timing = replace(RoomTiming(), frames=asked.frames)
+        native.write(simulate_room(rig=rig, timing=timing, seed=asked.seed), source)
+    capture, rows = read(source), []
+    for number, contender in enumerate(STUDIES[asked.study]):
+        rows.append(_compete(contender, capture, source, out / f"{number}", asked))
+        facts = {"capture": capture.name, "minutes": asked.minutes, "seed": asked.seed}
+        print(save(f"rooms_{asked.study}", rows, {k: str(v) for k, v in facts.items()}))
+    show(rows)
+
+
+def _compete(
+    contender: Contender, capture: Capture, source: Path, run: Path, asked: argparse.Namespace
+) -> Row:
+    console, name = Console(), contender.recipe
+    recipe = prepared(
+        name, recipe_named(name)(), contender.preset, capture=capture, device=asked.device
+    )
+    recipe = changed(recipe, contender.changes)
+    started = Started(name, recipe, str(source.resolve()), asked.seed)
+    options = Options(minutes=asked.minutes)
+    start(started, capture, run, options, device=asked.device, console=console)
+    opened = open_run(run, device=asked.device)
+    metrics = measure(opened, run, console, measuring=Measuring(train_views=1))
+    trained = json.loads((run / "training.json").read_text())
+    return {
+        "recipe": contender.name,
+        "changed": " ".join(contender.changes),
+        "psnr": metrics["mean"]["psnr"],
+        "ssim": metrics["mean"]["ssim"],
+        "steps": trained["steps"],
+        "seconds": trained["seconds"],
+        "peak MB": trained["peak_memory_mb"],
+    }
+
+
+if __name__ == "__main__":
+    main()
