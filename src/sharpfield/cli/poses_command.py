@@ -104,7 +104,7 @@ def _attach(
     made = attached.capture
     native.write(replace(made, name=out.name), out)
     names: tuple[str, ...] = () if original.frames is None else original.frames.names
-    lost = [names[i] for i in np.setdiff1d(np.arange(len(names)), attached.kept)]
+    lost = [str(names[int(i)]) for i in np.setdiff1d(np.arange(len(names)), attached.kept)]
     about = {
         "capture": original.name,
         "poses_from": path.layout,

@@ -7,23 +7,17 @@ Here it is the mean of views along the motion of the camera inside each exposure
 Where the capture has events, these say which frames are blurred, and make them sharp.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from sharpfield.core.paper import Paper
+from sharpfield.recipes.hybrid import PAPER
 from sharpfield.recipes.looks import LookOptions
 from sharpfield.recipes.splat_scene import GaussianOptions
 from sharpfield.recipes.splats import Splat
 
-DAI = Paper(
-    key="dai2023hybrid",
-    title="Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur",
-    bibtex="""@inproceedings{dai2023hybrid,
-  title     = {Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur},
-  author    = {Dai, Peng and Zhang, Yinda and Yu, Xin and Lyu, Xiaoyang and Qi, Xiaojuan},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2023}
-}""",
+DAI = replace(
+    PAPER,
     departures=(
         "Gaussians instead of neural points and image features.",
         "Blur is the mean of views along the camera's motion, instead of a kernel for each patch.",
