@@ -1,7 +1,9 @@
 """A camera's own files, one module per format, opened without being loaded."""
 
+from sharpfield.recordings.aedat4_writer import write_aedat4
 from sharpfield.recordings.open import FORMATS, Format, Told, open_events, open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.ros1_bag_writer import write_ros1_bag
 
 __all__ = [
     "FORMATS",
@@ -13,4 +15,6 @@ __all__ = [
     "Trouble",
     "open_events",
     "open_recording",
+    "write_aedat4",
+    "write_ros1_bag",
 ]

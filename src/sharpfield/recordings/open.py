@@ -227,7 +227,11 @@ FORMATS: dict[str, Format] = {
     ),
     "dat": Format(_is_dat, open_dat, "events", "a header with `%` and no `% evt`", (".dat",)),
     "aedat2": Format(
-        _begins(b"#!AER-DAT2", b"#!AER-DAT1"), open_aedat2, "events", "`#!AER-DAT2`", (".aedat",)
+        _begins(b"#!AER-DAT2", b"#!AER-DAT1"),
+        open_aedat2,
+        "events, frames of DAVIS with exposures, triggers",
+        "`#!AER-DAT2`",
+        (".aedat",),
     ),
     "aedat3": Format(
         _begins(b"#!AER-DAT3"),
