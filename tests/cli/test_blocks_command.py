@@ -54,6 +54,16 @@ def test_a_finished_command_does_nothing_again(capture: Path, alone: Path):
     assert (tensors(alone / "blocks" / "1of2"), tensors(alone)) == before
 
 
+def test_finished_blocks_of_other_settings_are_refused(
+    capture: Path, alone: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = tensors(alone)
+    others = (*TRAINED, *SMALL, "looks.depth=0.2")
+    assert run("blocks", "room-splat", str(capture), "--out", str(alone), *others) == 2
+    assert "depth" in capsys.readouterr().err
+    assert tensors(alone) == before
+
+
 def test_workers_side_by_side_one_of_them_killed_make_the_same(capture: Path, alone: Path):
     out = capture.parent / "together"
     command = [

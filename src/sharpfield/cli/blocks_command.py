@@ -18,9 +18,9 @@ from sharpfield.core.errors import OptionError
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.merge import merge
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started, write_started
+from sharpfield.recipes.saved import Started, read_started, write_started
 from sharpfield.training import Ledger, Options, adam, read_ledger
-from sharpfield.training.checkpoint import Progress, save_last
+from sharpfield.training.checkpoint import Progress, check_settings, save_last
 from sharpfield.training.record import write_ledger
 
 FOLDER = "blocks"
@@ -72,9 +72,12 @@ def blocks(
     made = changed(made, choice.change)
     whole = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
+    started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
+    for run, block in zip(runs, started, strict=True):
+        if read_ledger(run) is not None:  # finished ones are not opened again
+            check_settings(read_started(run).settings(), block.settings())
     for i in _mine(count, os.environ):
-        block = replace(whole, block=f"{i + 1}/{count}")
-        done = read_ledger(runs[i])
+        block, done = started[i], read_ledger(runs[i])
         if done is not None and done.finished:
             continue
         console.print(f"Block {block.block}", highlight=False)
