@@ -7,8 +7,8 @@ import torch
 
 from sharpfield.captures import colmap, deblur_nerf
 from sharpfield.captures.colmap_model import camera_of, find_model, read_model
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 CAMERA = (7, 1, 32, 24, (40.0, 42.0, 16.0, 12.0))  # number, PINHOLE, size, fx fy cx cy
 QUARTER = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # a quarter turn about y

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sharpfield.captures import layout_of, read
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 IDENTITY = np.eye(4).tolist()
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from sharpfield.captures import deblur_nerf
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 
 def written(folder, count=9, size=(6, 8), stored=(24, 32, 40.0)):

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from sharpfield.captures import layout_of, read
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 WIDTH, HEIGHT, POSES, COUNT = 346, 260, 5, 400
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from sharpfield.captures import llff_events
-from sharpfield.captures.images import write_image
 from sharpfield.captures.read import read
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 WIDTH, HEIGHT = 12, 10
 STAMPS = np.arange(1_000_000, 1_100_001, 5_000)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sharpfield.captures import nerf_synthetic
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 ANGLE = 2 * math.atan(0.5)  # the focal length equals the width
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sharpfield.captures import nerfstudio
-from sharpfield.captures.images import write_image
 from sharpfield.captures.ply import Ply, write_ply
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 INTRINSICS = {"fl_x": 10.0, "fl_y": 11.0, "cx": 4.5, "cy": 3.5, "w": 8, "h": 6}
 

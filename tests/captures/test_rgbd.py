@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sharpfield.captures import read, write_scannet
-from sharpfield.captures.images import read_image, write_image
 from sharpfield.captures.mapped_images import mapped_images
 from sharpfield.captures.read import layout_of
 from sharpfield.captures.rgbd import resized, usable_poses
 from sharpfield.core import Camera, Capture, CaptureError, DepthMaps
+from sharpfield.storage.images import read_image, write_image
 from tests.streams import HEIGHT, WIDTH
 
 COUNT = 12

@@ -7,8 +7,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sharpfield.captures import layout_of, read
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import write_image
 
 WIDTH, HEIGHT, POSES, COUNT = 16, 12, 6, 300
 FIRST_NS = 3_000_000_000

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from sharpfield.captures.images import read_image
 from sharpfield.core import EventStream
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation.event_frames import (
@@ -11,6 +10,7 @@ from sharpfield.evaluation.event_frames import (
     without_few,
     write_frames,
 )
+from sharpfield.storage.images import read_image
 from tests.evaluation.fake import random_events
 
 

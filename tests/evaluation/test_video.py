@@ -2,9 +2,9 @@ import av
 import numpy as np
 import pytest
 
-from sharpfield.captures.images import list_images, read_images
 from sharpfield.core import OptionError
 from sharpfield.evaluation.video import film, write_film
+from sharpfield.storage.images import list_images, read_images
 
 
 def pictures(count=6, size=(50, 80), channels=3):

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from sharpfield.captures.images import read_image, write_image
 from sharpfield.core import CaptureError
 from sharpfield.preparation.blur_pictures import blur_pictures
 from sharpfield.simulation.motion_kernel import KernelRange
+from sharpfield.storage.images import read_image, write_image
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.images import read_image
 from sharpfield.core import Capture, CaptureError, EventStream, Exposure, OptionError, Split
 from sharpfield.preparation import (
     DeblurOptions,
@@ -19,6 +18,7 @@ from sharpfield.preparation import (
     find_thresholds,
 )
 from sharpfield.simulation import EventSensor, Rig, Timing, simulate
+from sharpfield.storage.images import read_image
 
 THRESHOLD = 0.2
 

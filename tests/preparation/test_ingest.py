@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from sharpfield.captures import native, read
-from sharpfield.captures.images import write_image
 from sharpfield.core import Capture, EventStream
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.geometry.trajectory import Stamped
@@ -24,6 +23,7 @@ from sharpfield.recordings.ros1_bag_writer import write_ros1_bag
 from sharpfield.simulation import EventSensor, Rig, simulate
 from sharpfield.simulation import Timing as Exposures
 from sharpfield.storage import exporting_events
+from sharpfield.storage.images import write_image
 
 SIZE = (32, 24)
 SAME = Choices(timing=Timing(clock="same"), scene=Scene(encoding="gamma2.2"))

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from sharpfield.captures.images import read_image
 from sharpfield.core import OptionError, Split
 from sharpfield.preparation.quality_report import (
     QualityOptions,
@@ -16,6 +15,7 @@ from sharpfield.preparation.quality_report import (
 )
 from sharpfield.simulation.simulate import Rig
 from sharpfield.simulation.simulate_room import RoomTiming, simulate_room
+from sharpfield.storage.images import read_image
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from sharpfield.captures.colmap_model import Model, find_model, read_model
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import SUFFIXES, read_images
 from sharpfield.captures.photos import (
     HOLD_OUT,
     Missing,
@@ -24,6 +23,7 @@ from sharpfield.captures.photos import (
 )
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import SUFFIXES, read_images
 
 
 def recognise(folder: Path) -> bool:

@@ -17,7 +17,6 @@ from jaxtyping import Float64
 
 from sharpfield.captures.colmap_model import find_model, read_model
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import (
     HOLD_OUT,
     Photos,
@@ -28,6 +27,7 @@ from sharpfield.captures.poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import list_images, read_images
 
 SAME_PLACE = 0.01
 """Two reconstructions are the same if no camera differs by more than this, in nearest depths."""

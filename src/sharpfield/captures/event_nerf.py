@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.event_cache import read_events
-from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.nerfstudio import guessed_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
@@ -28,6 +27,7 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import Stamped, Tracks, check_poses
 from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.images import list_images, read_images
 
 SENSOR = (346, 260)
 """Width and height in px of the authors' sensor, real and simulated."""

@@ -28,7 +28,6 @@ from jaxtyping import Bool, Int64, Shaped
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.event_cache import read_events
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import list_images, read_images
 from sharpfield.captures.photos import choose_images
 from sharpfield.captures.poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
@@ -44,6 +43,7 @@ from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.arrays import load_array, load_arrays
 from sharpfield.storage.event_columns import whole_us
 from sharpfield.storage.event_layouts import THRESHOLDS, open_events
+from sharpfield.storage.images import list_images, read_images
 
 LAYOUT = "ev-deblur-nerf"
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt16
 
-from sharpfield.captures.images import describe, read_image, write_image
 from sharpfield.captures.mapped_images import mapped_images
 from sharpfield.captures.native_camera import camera_table, read_camera
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.depth import DepthMaps
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import describe, read_image, write_image
 
 DEPTH = "depth"
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from sharpfield.captures.images import describe, read_image, read_images, write_image
 from sharpfield.captures.mapped_images import mapped_images
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Split
@@ -21,6 +20,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.storage.arrays import load_array
+from sharpfield.storage.images import describe, read_image, read_images, write_image
 
 FRAMES, TRUTH = "frames", "truth"
 GEOMETRY = {"depth": (), "flow": (2,)}

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import read_images
 from sharpfield.captures.photos import HOLD_OUT, Missing, Photos, existing, photo_capture
 from sharpfield.captures.transforms import (
     frame_name,
@@ -26,6 +25,7 @@ from sharpfield.captures.transforms import (
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import read_images
 
 BOUNDS = (2.0, 6.0)
 """Nearest and farthest depth of these scenes."""

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import read_images
 from sharpfield.captures.photos import (
     HOLD_OUT,
     Missing,
@@ -38,6 +37,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.focus import focus
+from sharpfield.storage.images import read_images
 
 LENSES = {
     "PINHOLE": ("pinhole", ()),

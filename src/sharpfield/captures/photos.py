@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from sharpfield.captures.images import list_images
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import Still
+from sharpfield.storage.images import list_images
 
 SECOND_US = 1_000_000
 

@@ -44,6 +44,27 @@ def read_poses(path: Path) -> Path3:
     return times_us, poses
 
 
+def poses_of_quaternions(
+    rows: Float64[np.ndarray, "p 7"], where: object, *, do: str = "check the order of the columns"
+) -> Float64[np.ndarray, "p 3 4"]:
+    """Poses of rows `x y z qx qy qz qw`.
+
+    Raises:
+        CaptureError: A quaternion is not of length one; `do` says how the columns should be.
+    """
+    length = np.linalg.norm(rows[:, 3:], axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1) < UNIT_LENGTH))
+    if len(wrong):
+        raise CaptureError(
+            "a quaternion must have length one",
+            where=f"{where}, pose {wrong[0]}",
+            got=f"length {length[wrong[0]]:.4g}",
+            do=do,
+        )
+    wxyz = torch.from_numpy(rows[:, [6, 3, 4, 5]] / length[:, None])
+    return np.concatenate([se3.rotation_from_quaternion(wxyz).numpy(), rows[:, :3, None]], -1)
+
+
 def _native(path: Path) -> Path3:
     arrays = load_arrays(path)
     for prefix in ("", "0_"):
@@ -67,18 +88,7 @@ def _tum(path: Path) -> Path3:
         raise _not_tum(path, error) from None
     if not rows.size or rows.shape[1] != TUM_COLUMNS:
         raise _not_tum(path, f"{rows.shape[1]} columns" if rows.size else "no poses")
-    length = np.linalg.norm(rows[:, 4:], axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1) < UNIT_LENGTH))
-    if len(wrong):
-        raise CaptureError(
-            "a quaternion must have length one",
-            where=f"{path}, pose {wrong[0]}",
-            got=f"length {length[wrong[0]]:.4g}",
-            do="the columns are t x y z qx qy qz qw",
-        )
-    wxyz = torch.from_numpy(rows[:, [7, 4, 5, 6]] / length[:, None])
-    rotation = se3.rotation_from_quaternion(wxyz).numpy()
-    poses = np.concatenate([rotation, rows[:, 1:4, None]], -1)
+    poses = poses_of_quaternions(rows[:, 1:], path, do="the columns are t x y z qx qy qz qw")
     return np.rint(rows[:, 0] * 1e6).astype(np.int64), poses
 
 

@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float64, Int64
 
 from sharpfield.captures.colmap_model import Model, find_model, read_model
-from sharpfield.captures.pose_file import TUM_COLUMNS, UNIT_LENGTH, read_poses
+from sharpfield.captures.pose_file import TUM_COLUMNS, UNIT_LENGTH, poses_of_quaternions, read_poses
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import check_poses
@@ -122,7 +122,7 @@ def read_hand_eye(path: Path) -> Float64[np.ndarray, "3 4"]:
         raise CaptureError("hand-eye file not found", where=path)
     rows = _numbers(path, None)
     if rows.size == POSE_COLUMNS:
-        pose = _from_quaternions(rows.reshape(1, POSE_COLUMNS), path)
+        pose = poses_of_quaternions(rows.reshape(1, POSE_COLUMNS), path)
     elif rows.shape in ((3, 4), (4, 4)):
         pose = rows[None, :3]
     else:
@@ -149,7 +149,7 @@ def _euroc(path: Path) -> OuterPath:
     rows = _numbers(path, ",")
     if rows.shape[1] < EUROC_COLUMNS:
         raise _malformed(path, f"{rows.shape[1]} columns", "t [ns], x, y, z, qw, qx, qy, qz")
-    poses = _from_quaternions(rows[:, [1, 2, 3, 5, 6, 7, 4]], path)
+    poses = poses_of_quaternions(rows[:, [1, 2, 3, 5, 6, 7, 4]], path)
     with path.open(encoding="utf-8", errors="replace") as file:  # float64 does not hold ns of 1970
         times = [line.split(",")[0] for line in file if line.strip() and line.strip()[0] != "#"]
     return OuterPath(
@@ -207,7 +207,7 @@ def _stage(path: Path) -> OuterPath:
     if {"qx", "qy", "qz", "qw"} <= columns.keys():
         quaternion = np.stack([columns[q] for q in ("qx", "qy", "qz", "qw")], -1)
         return OuterPath(
-            "csv", _from_quaternions(np.concatenate([place, quaternion], -1), path), times_us
+            "csv", poses_of_quaternions(np.concatenate([place, quaternion], -1), path), times_us
         )
     rotation = np.broadcast_to(np.eye(3), (len(table), 3, 3))
     for i, axis in enumerate("xyz"):
@@ -225,23 +225,6 @@ def _measured(
         if f"{axis}_{unit}" in columns:
             return columns[f"{axis}_{unit}"] * factor
     return np.zeros(len(next(iter(columns.values()))))
-
-
-def _from_quaternions(
-    rows: Float64[np.ndarray, "p 7"], where: object
-) -> Float64[np.ndarray, "p 3 4"]:
-    """Poses of `x y z qx qy qz qw`."""
-    length = np.linalg.norm(rows[:, 3:], axis=1)
-    wrong = np.flatnonzero(~(np.abs(length - 1) < UNIT_LENGTH))
-    if len(wrong):
-        raise CaptureError(
-            "a quaternion must have length one",
-            where=f"{where}, pose {wrong[0]}",
-            got=f"length {length[wrong[0]]:.4g}",
-            do="check the order of the columns",
-        )
-    wxyz = torch.from_numpy(rows[:, [6, 3, 4, 5]] / length[:, None])
-    return np.concatenate([se3.rotation_from_quaternion(wxyz).numpy(), rows[:, :3, None]], -1)
 
 
 def _orthonormal(poses: Float64[np.ndarray, "p 3 4"]) -> Float64[np.ndarray, "p 3 4"]:

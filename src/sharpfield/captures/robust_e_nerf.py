@@ -21,7 +21,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Shaped
 
-from sharpfield.captures.images import SUFFIXES, read_images
 from sharpfield.captures.nerfstudio import guessed_bounds
 from sharpfield.captures.transforms import frame_name, frames_of, image_path, poses_of, read_json
 from sharpfield.core.camera import Camera
@@ -34,6 +33,7 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.arrays import load_arrays
 from sharpfield.storage.event_columns import coordinates, polarity, whole_us
+from sharpfield.storage.images import SUFFIXES, read_images
 
 EVENTS, POSES, CALIBRATION = "raw_events.npz", "camera_poses.npz", "camera_calibration.npz"
 

@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import SUFFIXES, read_image
 from sharpfield.captures.native_depth import decode_depth
 from sharpfield.captures.ply import columns, read_ply
 from sharpfield.captures.rgbd import (
@@ -36,6 +35,7 @@ from sharpfield.captures.rgbd import (
 )
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import SUFFIXES, read_image
 
 PUBLISHED_SPLIT = "train:5"
 """One frame in five is learned from, see `captures.hold_out`."""

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from sharpfield.captures.images import Alpha, read_images
 from sharpfield.captures.transforms import (
     frame_name,
     frames_of,
@@ -25,6 +24,7 @@ from sharpfield.captures.transforms import (
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import Alpha, read_images
 
 SECOND_US = 1_000_000
 ONE_SECOND = Clock(0, SECOND_US)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from sharpfield.captures.images import SUFFIXES
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.trajectory import check_poses
+from sharpfield.storage.images import SUFFIXES
 
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
 

@@ -18,7 +18,6 @@ from jaxtyping import Float32, Int64
 
 from sharpfield.captures.evdnerf import recognise
 from sharpfield.captures.folders import expect_replaceable
-from sharpfield.captures.images import write_image
 from sharpfield.captures.transforms import OPENCV_FROM_OPENGL
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
@@ -28,6 +27,7 @@ from sharpfield.geometry.trajectory import Still
 from sharpfield.ops.event_image import window_image
 from sharpfield.ops.event_index import build
 from sharpfield.storage.event_layouts import THRESHOLDS
+from sharpfield.storage.images import write_image
 
 SECOND_NS = 1_000_000_000
 

@@ -17,7 +17,6 @@ from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.images import write_image
 from sharpfield.captures.llff_events import BLENDER, COLOR_DAVIS, RGGB, Variant, recognise
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
@@ -28,6 +27,7 @@ from sharpfield.core.frames import Frames
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.event_file import CHUNK
 from sharpfield.storage.event_layouts import THRESHOLDS
+from sharpfield.storage.images import write_image
 
 STAMP_US = 5_000
 """Distance of the stamps where the trajectory is not stamped itself."""

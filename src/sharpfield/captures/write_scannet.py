@@ -11,12 +11,12 @@ import numpy as np
 
 from sharpfield.captures import scannet
 from sharpfield.captures.folders import expect_replaceable
-from sharpfield.captures.images import write_image
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.depth import MILLIMETRE
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import replacing_folder
+from sharpfield.storage.images import write_image
 
 
 def write(capture: Capture, folder: Path | str) -> None:

@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.markup import escape
 from tyro.conf import Positional
 
-from sharpfield.captures.images import write_image
 from sharpfield.cli.doctor_page import verdict, write_page
 from sharpfield.core.files import replacing
 from sharpfield.preparation.doctor import examine_path
 from sharpfield.preparation.doctor_findings import Checkup
+from sharpfield.storage.images import write_image
 
 FINDINGS, PAGE = "doctor.json", "doctor.html"
 STYLE = {"error": "bold red", "warning": "yellow", "note": "dim"}

@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tyro.conf import Positional
 
-from sharpfield.captures.images import write_image
 from sharpfield.captures.pose_file import read_poses
 from sharpfield.cli.capture_commands import parse_size
 from sharpfield.cli.run_commands import Device
@@ -38,6 +37,7 @@ from sharpfield.evaluation.event_twin import (
 )
 from sharpfield.simulation.event_sensor import SENSORS, SIZES, EventSensor
 from sharpfield.storage.event_formats import expect_format, exporting_events
+from sharpfield.storage.images import write_image
 
 RECORDED = "recorded"
 OWN_SIZE = "sensor"

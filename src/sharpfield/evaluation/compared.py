@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from sharpfield.captures.images import read_image
 from sharpfield.core.capture import Capture
 from sharpfield.evaluation.page import Colours, Picture, View
 from sharpfield.evaluation.pictures import colour_error, eight_bit
 from sharpfield.evaluation.reference import SHARP, TRUTH, Reference, held_out, spread, trained_on
 from sharpfield.evaluation.tables import number
 from sharpfield.metrics import luma
+from sharpfield.storage.images import read_image
 
 VIEWS = 4
 """Most views of a kind to show; the tables have them all."""

@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.captures.images import write_image
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
@@ -36,6 +35,7 @@ from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
 from sharpfield.metrics import Lpips, laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX
 from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, render_view, renderer_of
+from sharpfield.storage.images import write_image
 
 METRICS = "metrics.json"
 

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int32
 
-from sharpfield.captures.images import write_image
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.evaluation.pictures import FULL, colour_signs
 from sharpfield.evaluation.video import write_film
 from sharpfield.ops.event_image import splat_nearest
+from sharpfield.storage.images import write_image
 
 COUNTS, FRAMES, FILM = "counts.npy", "frames.npy", "frames.mp4"
 

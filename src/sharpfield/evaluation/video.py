@@ -16,9 +16,9 @@ from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import Colorspace
 from jaxtyping import UInt8
 
-from sharpfield.captures.images import list_images, write_image
 from sharpfield.core.errors import OptionError
 from sharpfield.core.files import replacing, replacing_folder
+from sharpfield.storage.images import list_images, write_image
 
 QUALITY = 18
 """Constant rate factor of x264: visually lossless."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
-from sharpfield.ops.event_index import EventIndex
+from sharpfield.ops.event_index import EventIndex, first_since
 
 RAMP_US = 7_000
 """Longest ramp; what moves slower stood still before. 5 to 10 ms serve a hand-held camera best."""
@@ -55,19 +55,6 @@ def ramped_log_mean(
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _after(t_us, low, high, time_us):
-    """Position of the first event later than a time."""
-    while low < high:
-        middle = (low + high) // 2
-        if t_us[middle] <= time_us:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
 def _begin(t_us, first, event):
     """When the ramp to an event begins."""
     begin = t_us[event] - RAMP_US
@@ -78,7 +65,7 @@ def _begin(t_us, first, event):
 @no_type_check
 def _ramps(offset, t_us, p, time_us, parts):
     for site in range(len(parts)):
-        event = _after(t_us, offset[site], offset[site + 1], time_us)
+        event = first_since(t_us, offset[site], offset[site + 1], time_us + 1)
         if event == offset[site + 1]:
             continue
         begin = _begin(t_us, offset[site], event)
@@ -109,7 +96,7 @@ def _log_means(offset, t_us, p, window_us, thresholds, mean):
     opens, closes = window_us
     for site in range(len(mean)):
         first, last = offset[site], offset[site + 1]
-        event = _after(t_us, first, last, opens)
+        event = first_since(t_us, first, last, opens + 1)
         now, level, area, started = opens, 0.0, 0.0, False
         while now < closes:
             end, slope_from, step, ramp = closes, closes, 0.0, 1.0

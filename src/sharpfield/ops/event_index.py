@@ -218,8 +218,8 @@ def _place(site, t_us, p, first, begin, cursor, t_out, p_out):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _search(t_us, low, high, time):
-    """First position in low ... high - 1 whose time is at least `time`, or `high`."""
+def first_since(t_us, low, high, time):
+    """First position in low ... high - 1 whose time is at least `time`, or `high`; for kernels."""
     while low < high:
         middle = (low + high) >> 1
         if t_us[middle] < time:
@@ -254,7 +254,7 @@ def _next(offset, t_us, site, time):
     found = np.empty(site.size, np.int64)
     for i in range(site.size):
         end = offset[site[i] + 1]
-        k = _search(t_us, offset[site[i]], end, time[i] + 1)
+        k = first_since(t_us, offset[site[i]], end, time[i] + 1)
         found[i] = k if k < end else -1
     return found
 
@@ -265,7 +265,7 @@ def _previous(offset, t_us, site, time):
     found = np.empty(site.size, np.int64)
     for i in range(site.size):
         begin = offset[site[i]]
-        k = _search(t_us, begin, offset[site[i] + 1], time[i])
+        k = first_since(t_us, begin, offset[site[i] + 1], time[i])
         found[i] = k - 1 if k > begin else -1
     return found
 

@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sharpfield.captures.images import list_images, read_image, write_image
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import replacing_folder
 from sharpfield.core.seed import numpy_generator
 from sharpfield.simulation.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
+from sharpfield.storage.images import list_images, read_image, write_image
 
 ABOUT = "blur.json"
 

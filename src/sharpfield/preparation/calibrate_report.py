@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from sharpfield.captures.images import write_image
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
 from sharpfield.preparation.calibrate import Calibration
 from sharpfield.preparation.thresholds import known_thresholds
 from sharpfield.storage.arrays import write_arrays
+from sharpfield.storage.images import write_image
 
 NUMBERS, PIXELS, PICTURE = "calibration.json", "pixels.npz", "pixels.png"
 

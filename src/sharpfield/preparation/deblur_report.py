@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Shaped, UInt8
 
-from sharpfield.captures.images import write_image
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
 from sharpfield.formation.edi_threshold import edge_density
 from sharpfield.metrics.image import psnr
 from sharpfield.metrics.sharpness import gradient_energy, luma
 from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur
+from sharpfield.storage.images import write_image
 
 SHEET_ROWS, GAP = 4, 4
 """The contact sheet: so many frames below each other, so many pixels between pictures."""

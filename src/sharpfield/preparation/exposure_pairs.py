@@ -31,7 +31,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.formation.edi import FLOOR
 from sharpfield.formation.tone import Tone, tone_of
 from sharpfield.metrics.sharpness import luma
-from sharpfield.ops.event_index import EventIndex
+from sharpfield.ops.event_index import EventIndex, first_since
 from sharpfield.ops.site_colour import site_channels
 from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light
 
@@ -167,24 +167,11 @@ def _weigh(offset, t_us, p, dead_us, weight):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _after(t_us, low, high, time_us):
-    """Position of the first event later than a time."""
-    while low < high:
-        middle = (low + high) // 2
-        if t_us[middle] <= time_us:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
 def _tell(sites, offset, t_us, p, weight, windows_us, thresholds, found):
     for site in range(len(sites)):
         first, last = offset[sites[site]], offset[sites[site] + 1]
-        start = _after(t_us, first, last, windows_us[0, 0])
-        end = _after(t_us, start, last, windows_us[1, 0])
+        start = first_since(t_us, first, last, windows_us[0, 0] + 1)
+        end = first_since(t_us, start, last, windows_us[1, 0] + 1)
         for i in range(start, end):
             sign = 1 if p[i] > 0 else 0
             found[site, 1 + sign] += weight[i]

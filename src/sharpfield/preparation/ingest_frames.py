@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from sharpfield.captures.images import write_image
 from sharpfield.captures.native_frames import PLAIN_NAME
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import replacing
 from sharpfield.preparation.ingest_lens import Geometry
 from sharpfield.recordings.recording import Frame
+from sharpfield.storage.images import write_image
 
 SMALL = 64
 """Width in pixels of the pictures whose change is measured."""

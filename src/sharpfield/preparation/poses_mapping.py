@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from sharpfield.captures.colmap_model import camera_of
-from sharpfield.captures.images import write_image
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.extras import need
+from sharpfield.storage.images import write_image
 
 Intrinsics = Literal["given", "refine", "find"]
 Lens = Literal["pinhole", "radial", "brown", "fisheye"]

@@ -5,8 +5,8 @@ import zlib
 import numpy as np
 import pytest
 
-from sharpfield.captures.images import list_images, read_image, read_images, write_image
 from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import list_images, read_image, read_images, write_image
 
 
 def picture(dtype=np.uint8, channels=3, size=(4, 6)):
