@@ -13,13 +13,13 @@ import numpy as np
 import torch
 import tyro
 
-from sharpfield.captures.images import write_image
 from sharpfield.evaluation.pictures import eight_bit
 from sharpfield.metrics import psnr
 from sharpfield.recipes import EvDeblurNeRF
 from sharpfield.recipes.presets import prepared
 from sharpfield.rendering.view import render_view
 from sharpfield.simulation import Rig, Timing, simulate
+from sharpfield.storage.images import write_image
 from sharpfield.training import adam, fit
 
 

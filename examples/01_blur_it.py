@@ -14,10 +14,10 @@ import numpy as np
 import torch
 import tyro
 
-from sharpfield.captures.images import write_image
 from sharpfield.core import Pixels, Radiance, Rays
 from sharpfield.formation import Shutter, tone_of
 from sharpfield.simulation import Rig, Scene, Timing, scene, simulate
+from sharpfield.storage.images import write_image
 
 FRAME = 1
 

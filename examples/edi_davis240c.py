@@ -23,11 +23,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sharpfield.captures.images import list_images, read_images, write_image
 from sharpfield.formation.edi import latent, path_of_slices
 from sharpfield.formation.edi_threshold import best_threshold, disagreement
 from sharpfield.formation.log_path import LogPath
 from sharpfield.formation.threshold import FixedThresholds
+from sharpfield.storage.images import list_images, read_images, write_image
 
 JUDGED = 12
 """Pairs of neighbouring frames that choose the threshold."""

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 
 from sharpfield.captures import read
-from sharpfield.captures.images import read_image, write_image
 from sharpfield.core.events import EventStream
 from sharpfield.recipes.saved import read_started
+from sharpfield.storage.images import read_image, write_image
 
-SCALE, GAP = 3, 9
+SCALE, GAP = 2, 6
 RED, BLUE = (200, 40, 40), (40, 60, 200)
 
 
