@@ -157,8 +157,8 @@ def simulate(
 
     Args:
         out: Folder of the capture.
-        scene: A scene by name: garden, shelf, tiles, mobile; spinner, arm, jelly, which move
-            and are seen from all around; or room, which is walked through with a depth camera.
+        scene: A scene by name: garden, shelf, tiles, mobile; spinner, arm, jelly, glider, puppet, which
+            move and are seen from all around; or room, which is walked through with a depth camera.
         size: Of the sensor, in pixels; by default 240x160, 64x64 for a moving scene, or 240x180
             for the room.
         layout: Files to write.

@@ -1,8 +1,9 @@
 """Scenes in which something moves, for cameras all around: rigid, articulated, deforming.
 
-The world's z axis points up. All that moves stays within 1.2 of the origin, above a patterned
-table that stands still, before an even grey. Motions take about a second and never rest. As seen
-from 4 away and 30 degrees above, depths are 2 to 6.5.
+The world's z axis points up. All that moves stays within 1.2 of the origin, before an even grey.
+Motions take about a second and never rest. As seen from 4 away and 30 degrees above, depths are 2
+to 6.5. Some stand on a patterned table that stands still, which events cannot show; those of
+`ALONE` are all that there is to see, as in the data that EvDNeRF (WACV 2024) was shown on.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,7 @@ TABLE: list[Part] = [
         box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)),
     ),
 ]
-"""What stands still in every one of them."""
+"""What some of them stand on."""
 
 
 def moving_scene(name: str) -> Scene:
@@ -173,9 +174,88 @@ def _jelly() -> Moving:
     return parts, maps
 
 
+def _glider() -> Moving:
+    """Rigid: a painted glider that comes down, turns and banks."""
+    hull = Paint("#f3ead8", "#b3263a", "#2456a6", STRIPES, 2.4)
+    wing = Paint("#f4d06f", "#24476b", texture=CHECKS, cells=2.1)
+    tail = Paint("#2e7d58", "#f6e7b4", texture=CHECKS, cells=2.6)
+    fin = Paint("#e8743b", "#5c1f12", texture=CHECKS, cells=2.6)
+    parts = [
+        (1, box((0, 0, 0), (1.4, 0.36, 0.36), hull)),
+        (1, ball((0.7, 0, 0), 0.24, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=4))),
+        (1, box((0.12, 0, 0.14), (0.6, 1.84, 0.13), wing)),
+        (1, box((-0.6, 0, 0.14), (0.3, 0.9, 0.12), tail)),
+        (1, box((-0.62, 0, 0.38), (0.3, 0.12, 0.46), fin)),
+        (1, ball((0.26, 0, 0.24), 0.2, Paint("#1d2b53", "#9fd3e8", texture=CHECKS, cells=4))),
+    ]
+
+    def maps(t: float) -> list[Map]:
+        turned = -0.5 + 1.5 * t + 0.2 * np.sin(TURN * 0.9 * t)
+        bank = 0.6 * np.sin(TURN * 0.8 * t + 0.4)
+        dive = 0.15 + 0.2 * np.sin(TURN * 0.7 * t + 1.0)
+        place = (0.22 * np.sin(2.6 * t - 1.3), 0.2 * np.cos(2.9 * t), 0.34 - 0.7 * t)
+        return [placed(place, yaw=turned, pitch=dive, roll=bank)]
+
+    return parts, maps
+
+
+def _puppet() -> Moving:
+    """Articulated: a puppet that hangs in the air, and swings its body, its arms and its legs."""
+    coat = Paint("#c8324a", "#f6e7c1", texture=CHECKS, cells=2.4)
+    sleeve = Paint("#f2c14e", "#2d4b73", texture=CHECKS, cells=3)
+    trousers = Paint("#2f7fb5", "#efe9dc", texture=CHECKS, cells=2.6)
+    parts = [
+        (1, box((0, 0, 0.1), (0.42, 0.66, 0.72), coat)),
+        (1, ball((0, 0, 0.7), 0.27, Paint("#f7dcc0", "#5c1f12", texture=CHECKS, cells=3.2))),
+    ]
+    for side in (0, 1):
+        parts += [
+            (2 + side, box((0, 0, -0.22), (0.22, 0.22, 0.48), sleeve)),
+            (4 + side, box((0, 0, -0.2), (0.2, 0.2, 0.46), sleeve)),
+            (6 + side, box((0, 0, -0.34), (0.28, 0.26, 0.72), trousers)),
+        ]
+
+    def maps(t: float) -> list[Map]:
+        sway = 0.35 * np.sin(TURN * 0.8 * t)
+        body = placed((0, 0.14 * np.sin(TURN * 0.9 * t), 0.1), yaw=1.3 * t - 0.5, roll=sway)
+        shoulders = [
+            after(
+                body,
+                placed(
+                    (0, side * 0.45, 0.4),
+                    pitch=-0.8 - side * 0.9 * np.sin(TURN * 0.9 * t + 0.5),
+                    roll=side * 0.3,
+                ),
+            )
+            for side in (-1, 1)
+        ]
+        elbows = [
+            after(shoulder, placed((0, 0, -0.46), pitch=-0.7 - 0.6 * np.sin(TURN * t + k)))
+            for k, shoulder in enumerate(shoulders)
+        ]
+        hips = [
+            after(
+                body,
+                placed(
+                    (0, side * 0.19, -0.26),
+                    pitch=side * 0.7 * np.sin(TURN * 0.9 * t + 0.2),
+                    roll=side * 0.1,
+                ),
+            )
+            for side in (-1, 1)
+        ]
+        return [body, *shoulders, *elbows, *hips]
+
+    return parts, maps
+
+
+ALONE: dict[str, Callable[[], Moving]] = {"glider": _glider, "puppet": _puppet}
+"""Scenes in which nothing stands still."""
+
 MOVING_SCENES: dict[str, Callable[[], Moving]] = {
     "spinner": _spinner,
     "arm": _arm,
     "jelly": _jelly,
+    **ALONE,
 }
 """Scenes by name."""
