@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.plain import Plain, PlainHead, PlainVolume
+from benchmarks.plain import Plain
+from benchmarks.plain_field import PlainHead, PlainVolume
 from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import PlaneHead, Volume
 from sharpfield.geometry.cast import cast
