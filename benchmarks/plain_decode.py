@@ -1,7 +1,12 @@
 """Event files decoded by numpy alone, whole and without state: what `decode` compares with.
 
-Each takes the bytes after the header and gives x, y, t in us, and whether brighter.
+Each takes the bytes after the header and gives x, y, t in us, and whether brighter; `bag` takes a
+bag of ROS 1, which another library opens.
 """
+
+import importlib
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +52,20 @@ def dat(data: bytes) -> Events:
     time, place = np.frombuffer(data[2:], "<u4").reshape(-1, 2).T
     wraps = np.cumsum(np.diff(time.astype(np.int64), prepend=time[:1]) < -(2**31))
     return place & 0x3FFF, place >> 14 & 0x3FFF, time + (wraps << 32), place >> 28
+
+
+def bag(path: Path) -> Events:
+    bags: Any = importlib.import_module("rosbags.rosbag1")
+    event = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("on", "u1")])
+    parts = []
+    with bags.Reader(path) as reader:
+        for _, _, data in reader.messages():
+            # A header of 12 bytes and a text, then height, width and number of events.
+            begin = 16 + int.from_bytes(data[12:16], "little") + 12
+            parts.append(np.frombuffer(data, event, offset=begin))
+    found = np.concatenate(parts)
+    t = found["s"] * np.int64(10**6) + (found["ns"] + 500) // 1000
+    return found["x"].copy(), found["y"].copy(), t, found["on"] > 0
 
 
 PLAIN = {"EVT2": evt2, "EVT2.1": evt21, "EVT3": evt3, "DAT": dat}

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.decode import repacked, tiled
-from benchmarks.plain_decode import PLAIN
+from benchmarks.plain_decode import PLAIN, bag
+from benchmarks.tiled import SINCE_US, bags, repacked, tiled
+from sharpfield.recordings import open_recording
 from sharpfield.recordings.dat import open_dat
 from sharpfield.recordings.evt import open_evt
 from sharpfield.recordings.percent_header import read_header
@@ -40,3 +41,18 @@ def test_plain_readers_agree_with_ours(kind: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.x[: len(events)], events.x)
     for ours, theirs in ((found.x, x), (found.y, y), (found.p > 0, bright)):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_bags_hold_the_same_events(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    events = random_events(2000, last_us=40_000)
+    bags(events, tmp_path, COPIES)
+    x, y, t_us, bright = bag(tmp_path / "ROS1.bag")
+    np.testing.assert_array_equal(t_us[: len(events)], events.t_us + SINCE_US)
+    for name in ("ROS1.bag", "ROS2.mcap", "ROS2.db3"):
+        recording = open_recording(tmp_path / name)
+        found = recording.load()
+        assert recording.size == (events.width, events.height) and not str(recording.trouble)
+        expected = (x, y, t_us, bright)
+        for ours, theirs in zip((found.x, found.y, found.t_us, found.p > 0), expected, strict=True):
+            np.testing.assert_array_equal(ours, theirs)

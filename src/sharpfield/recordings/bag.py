@@ -8,21 +8,20 @@ How messages are kept is the matter of `recordings.ros1_bag`, `recordings.mcap` 
 Source: the ROS wiki, "msg"; OMG, *DDS-XTypes*, 7.4 (plain CDR).
 """
 
-import io
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 from sharpfield.recordings.recording import Trouble
-from sharpfield.recordings.unpacking import Damaged
+from sharpfield.recordings.unpacking import Bytes, Damaged
 
 TEXT = 2**16
 """Bytes of the longest text in a message."""
 
-File = io.BufferedReader | io.BytesIO
-"""Of a disk, or of a part that was unpacked."""
+Read = Callable[[int, int], Bytes]
+"""Gives bytes from some place on: as many as asked for, or as there are."""
 
 
 class Topic(NamedTuple):
@@ -40,7 +39,7 @@ class Message(NamedTuple):
     topic: str
     logged_ns: int
     """When it was recorded, by the clock of the recording computer."""
-    data: bytes
+    data: Bytes
 
 
 @dataclass(frozen=True)
@@ -52,6 +51,22 @@ class Bag:
     topics: dict[str, Topic]
     messages: Callable[[Collection[str], Trouble], Iterator[Message]]
     """Those of some topics, in the order recorded; each call starts anew."""
+
+
+def of_file(file: BinaryIO) -> Read:
+    """Reads a file."""
+
+    def read(place: int, count: int) -> bytes:
+        file.seek(place)
+        return file.read(count)
+
+    return read
+
+
+def of_part(part: Bytes) -> Read:
+    """Reads what is in memory already, without copying."""
+    whole = memoryview(part)
+    return lambda place, count: whole[place : place + count]
 
 
 def topic_of(kind: str, *, cdr: bool) -> Topic:

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sharpfield.recordings.unpacking import Damaged
+from sharpfield.recordings.unpacking import Bytes, Damaged
 
 PREFIX = 12
 """Bytes of size, root and name before everything else."""
@@ -19,7 +19,7 @@ PREFIX = 12
 class Table:
     """A table in a buffer."""
 
-    data: bytes
+    data: Bytes
     place: int
 
     def number(self, field: int, kind: str, default: int = 0) -> int:
@@ -71,7 +71,7 @@ class Table:
         return self.place + offset if offset else None
 
 
-def root(data: bytes, name: str) -> Table:
+def root(data: Bytes, name: str) -> Table:
     """The root table of a buffer that begins with its size.
 
     Raises:
@@ -166,7 +166,7 @@ def _aligned(place: int) -> int:
     return (place + 7) // 8 * 8
 
 
-def _number(data: bytes, place: int, kind: str) -> int:
+def _number(data: Bytes, place: int, kind: str) -> int:
     if place < 0 or place + struct.calcsize(f"<{kind}") > len(data):
         raise Damaged(f"an offset to {place} in {len(data)} bytes")
     return struct.unpack_from(f"<{kind}", data, place)[0]

@@ -7,23 +7,22 @@ summary at the end is used only to learn of all channels at once.
 Source: https://mcap.dev/spec.
 """
 
-import io
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bag import Bag, File, Message, Topic, topic_of
+from sharpfield.recordings.bag import Bag, Message, Read, Topic, of_file, of_part, topic_of
 from sharpfield.recordings.blocks import head
 from sharpfield.recordings.recording import Trouble
-from sharpfield.recordings.unpacking import LIMIT, Damaged, unpacked
+from sharpfield.recordings.unpacking import LIMIT, Bytes, Damaged, unpacked
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
 FOOTER_SIZE = 9 + 20 + len(MAGIC)
 
 Channels = dict[int, tuple[str, Topic]]
-Record = tuple[int, bytes]
+Record = tuple[int, Bytes]
 
 
 def open_mcap(path: Path) -> Bag:
@@ -42,7 +41,7 @@ def open_mcap(path: Path) -> Bag:
             if kind == MESSAGE and len(content) >= 22:
                 number, _, logged_ns = struct.unpack_from("<HIQ", content)
                 if number in numbers:
-                    yield Message(numbers[number], logged_ns, content[22:])
+                    yield Message(numbers[number], logged_ns, memoryview(content)[22:])
 
     return Bag(path, "ROS2 MCAP", dict(channels.values()), messages)
 
@@ -84,9 +83,8 @@ def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
     """Records outside and inside of chunks, up to the end of the data or of the summary."""
     length = path.stat().st_size
     with path.open("rb") as file:
-        file.seek(begin)
         try:
-            for kind, content in _plain(file, length):
+            for kind, content in _plain(of_file(file), begin, length):
                 if kind in (DATA_END, FOOTER):
                     return
                 if kind != CHUNK:
@@ -94,7 +92,7 @@ def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
                     continue
                 try:
                     data = _chunk(content)
-                    yield from _plain(io.BytesIO(data), len(data))
+                    yield from _plain(of_part(data), 0, len(data))
                 except Damaged:
                     trouble.note("damaged chunks")
             trouble.note("torn ends of the file")
@@ -102,41 +100,43 @@ def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
             trouble.note("torn ends of the file")
 
 
-def _plain(file: File, end: int) -> Iterator[Record]:
-    while start := file.read(9):
+def _plain(read: Read, begin: int, end: int) -> Iterator[Record]:
+    place = begin
+    while start := read(place, 9):
         if len(start) < 9:
             raise Damaged("a torn record")
         kind, size = struct.unpack("<BQ", start)
-        if size > end - file.tell():
+        place += 9
+        if size > end - place:
             if kind == CHUNK:
                 # Of a recording that broke off, its last chunk may be read in part.
-                yield kind, file.read(LIMIT)
+                yield kind, read(place, LIMIT)
             raise Damaged("a torn record")
         if kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
             if size > LIMIT:
                 raise Damaged(f"a record of {size} bytes")
-            yield kind, file.read(size)
+            yield kind, read(place, size)
         else:
-            file.seek(size, io.SEEK_CUR)
             yield kind, b""
+        place += size
 
 
-def _chunk(content: bytes) -> bytes:
+def _chunk(content: Bytes) -> Bytes:
     """Its start and end, unpacked size and checksum are not needed."""
-    packing, content = _text(content[28:])
+    packing, content = _text(memoryview(content)[28:])
     size, content = _number(content, "Q")
     return unpacked(content[:size], packing or "none")
 
 
-def _number(data: bytes, kind: str) -> tuple[int, bytes]:
+def _number(data: Bytes, kind: str) -> tuple[int, Bytes]:
     size = struct.calcsize(f"<{kind}")
     if len(data) < size:
         raise Damaged("a torn record")
     return struct.unpack_from(f"<{kind}", data)[0], data[size:]
 
 
-def _text(data: bytes) -> tuple[str, bytes]:
+def _text(data: Bytes) -> tuple[str, Bytes]:
     length, data = _number(data, "I")
     if length > len(data):
         raise Damaged("a torn text")
-    return data[:length].decode("utf-8", "replace"), data[length:]
+    return bytes(data[:length]).decode("utf-8", "replace"), data[length:]

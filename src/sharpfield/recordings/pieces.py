@@ -115,8 +115,8 @@ class _Gate:
 
     def passed(self, piece: Piece) -> Piece:
         """The sound events of the next piece."""
-        outside, back = _faults(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
-        if outside or back:
+        if not _faultless(piece.x, piece.y, piece.t_us, *self._size, self._last_us):
+            outside, back = _faults(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
             keep = _sound(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
             self._note(piece, outside, back, keep)
             piece = piece[keep]
@@ -156,6 +156,19 @@ def _together(pieces: list[Piece]) -> Piece:
 
 def _stream(piece: Piece, size: tuple[int, int]) -> EventStream:
     return EventStream(piece.x, piece.y, piece.t_us, piece.p, width=size[0], height=size[1])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _faultless(x, y, t_us, width, height, last_us):
+    """Whether all lie on the sensor and none goes back: in loops that look at many at a time."""
+    right, below, back = np.uint16(0), np.uint16(0), np.int64(0)
+    for i in range(x.size):
+        right, below = max(right, x[i]), max(below, y[i])
+    for i in range(1, t_us.size):
+        back += np.int64(t_us[i] < t_us[i - 1])
+    late = t_us.size > 0 and t_us[0] < last_us
+    return right < width and below < height and back == 0 and not late
 
 
 @njit(cache=True, nogil=True)

@@ -7,17 +7,16 @@ name their connection. The index at the end is used only to learn of all connect
 Source: the ROS wiki, "Bags/Format/2.0".
 """
 
-import io
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bag import Bag, File, Message, Topic, topic_of
+from sharpfield.recordings.bag import Bag, Message, Read, Topic, of_file, of_part, topic_of
 from sharpfield.recordings.blocks import head
 from sharpfield.recordings.recording import Trouble
-from sharpfield.recordings.unpacking import LIMIT, Damaged, unpacked
+from sharpfield.recordings.unpacking import LIMIT, Bytes, Damaged, unpacked
 
 FIRST_LINE = b"#ROSBAG V2.0\n"
 MESSAGE, FILE, CHUNK, CONNECTION = 2, 3, 5, 7
@@ -66,13 +65,13 @@ def _indexed(path: Path) -> Connections:
     length = path.stat().st_size
     with path.open("rb") as file:
         try:
-            start = next(_records(file, len(FIRST_LINE), length), None)
+            start = next(_records(of_file(file), len(FIRST_LINE), length), None)
             index = start.number(b"index_pos", 8) if start and start.kind == FILE else -1
             if index <= len(FIRST_LINE):
                 return {}
             return dict(
-                _connection(file, record)
-                for record in _records(file, index, length)
+                _connection(of_file(file), record)
+                for record in _records(of_file(file), index, length)
                 if record.kind == CONNECTION
             )
         except Damaged:
@@ -82,69 +81,67 @@ def _indexed(path: Path) -> Connections:
 def _scanned(path: Path) -> Connections:
     """Connections as they come by."""
     found: Connections = {}
-    for file, record in _all_records(path, Trouble()):
+    for read, record in _all_records(path, Trouble()):
         if record.kind == CONNECTION:
             try:
-                found.update([_connection(file, record)])
+                found.update([_connection(read, record)])
             except Damaged:
                 continue
     return found
 
 
-def _connection(file: File, record: _Record) -> tuple[int, tuple[str, Topic]]:
-    file.seek(record.place)
-    fields = _fields(file.read(min(record.size, LONGEST)))
+def _connection(read: Read, record: _Record) -> tuple[int, tuple[str, Topic]]:
+    fields = _fields(bytes(read(record.place, min(record.size, LONGEST))))
     name = record.fields.get(b"topic", b"").decode("utf-8", "replace")
     kind = fields.get(b"type", b"").decode("utf-8", "replace")
     return record.number(b"conn", 4), (name, topic_of(kind, cdr=False))
 
 
 def _messages(path: Path, topics: dict[int, str], trouble: Trouble) -> Iterator[Message]:
-    for file, record in _all_records(path, trouble):
+    for read, record in _all_records(path, trouble):
         if record.kind == MESSAGE and (name := topics.get(record.number(b"conn", 4))) is not None:
-            file.seek(record.place)
             time = record.number(b"time", 8)
             logged_ns = (time & 0xFFFFFFFF) * 10**9 + (time >> 32)
-            yield Message(name, logged_ns, file.read(record.size))
+            yield Message(name, logged_ns, read(record.place, record.size))
 
 
-def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[File, _Record]]:
+def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[Read, _Record]]:
     """Records outside and inside of chunks, with what to read their data from."""
     length = path.stat().st_size
     with path.open("rb") as file:
+        read = of_file(file)
         try:
-            for record in _records(file, len(FIRST_LINE), length):
+            for record in _records(read, len(FIRST_LINE), length):
                 if record.kind != CHUNK:
-                    yield file, record
+                    yield read, record
                     continue
                 try:
-                    chunk = _chunk(file, record)
-                    for inner in _records(chunk, 0, len(chunk.getbuffer())):
-                        yield chunk, inner
+                    chunk = _chunk(read, record)
+                    read_part = of_part(chunk)
+                    for inner in _records(read_part, 0, len(chunk)):
+                        yield read_part, inner
                 except Damaged:
                     trouble.note("damaged chunks")
         except Damaged:
             trouble.note("torn ends of the file")
 
 
-def _chunk(file: File, record: _Record) -> io.BytesIO:
+def _chunk(read: Read, record: _Record) -> Bytes:
     if record.size > LIMIT:
         raise Damaged(f"a chunk of {record.size} bytes")
-    file.seek(record.place)
     packing = record.fields.get(b"compression", b"").decode("latin-1")
-    return io.BytesIO(unpacked(file.read(record.size), packing))
+    return unpacked(read(record.place, record.size), packing)
 
 
-def _records(file: File, begin: int, end: int) -> Iterator[_Record]:
+def _records(read: Read, begin: int, end: int) -> Iterator[_Record]:
     """Consecutive records; their data are not read."""
     place = begin
     while place < end:
-        file.seek(place)
-        length = _number(file.read(4))
+        length = _number(read(place, 4))
         if length > LONGEST:
             raise Damaged(f"a header of {length} bytes")
-        fields = _fields(file.read(length))
-        size = _number(file.read(4))
+        fields = _fields(bytes(read(place + 4, length)))
+        size = _number(read(place + 4 + length, 4))
         place += 8 + length
         if place + size > end:
             raise Damaged("a torn record")
@@ -165,7 +162,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
     return found
 
 
-def _number(data: bytes) -> int:
+def _number(data: Bytes) -> int:
     if len(data) < 4:
         raise Damaged("a torn number")
     return struct.unpack("<I", data)[0]

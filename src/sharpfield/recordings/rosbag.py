@@ -28,7 +28,7 @@ from sharpfield.recordings.event_messages import (
     ARRAYS,
     PACKETS,
     Packet,
-    event_array,
+    event_arrays,
     event_packet,
     start,
 )
@@ -36,8 +36,8 @@ from sharpfield.recordings.evt import ENCODINGS as EVT_ENCODINGS
 from sharpfield.recordings.evt import decoded, trigger_edges
 from sharpfield.recordings.image_messages import COMPRESSED, PLAIN, Image, image
 from sharpfield.recordings.mcap import open_mcap
-from sharpfield.recordings.pieces import Chunks, Piece, joined, known_size
-from sharpfield.recordings.recording import Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.pieces import joined, known_size
+from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
 from sharpfield.recordings.ros1_bag import open_ros1_bag
 from sharpfield.recordings.sqlite_bag import open_sqlite_bag
 from sharpfield.recordings.unpacking import Damaged
@@ -221,7 +221,8 @@ def _shift_us(source: Source) -> int:
 
 def _events(source: Source, trouble: Trouble) -> Chunks:
     if not source.encoding:
-        pieces = _arrays(source, trouble)
+        messages = source.bag.messages([source.topic], trouble)
+        pieces = event_arrays(messages, source.bag.topics[source.topic], trouble)
         return joined(pieces, source.size, where=source.bag.path, trouble=trouble)
     chunks = _decoded(source, _packets(source, trouble), trouble)
     return (replace(chunk, t_us=chunk.t_us + source.shift_us) for chunk in chunks)
@@ -241,17 +242,6 @@ def _triggers(source: Source) -> Triggers:
     payloads = (bytes(packet.payload) for packet in _packets(source, Trouble()))
     found = trigger_edges(source.encoding, payloads, where=source.bag.path)
     return replace(found, t_us=found.t_us + source.shift_us)
-
-
-def _arrays(source: Source, trouble: Trouble) -> Iterator[Piece]:
-    topic = source.bag.topics[source.topic]
-    for message in source.bag.messages([source.topic], trouble):
-        try:
-            piece = event_array(message, topic)
-        except Damaged:
-            trouble.note("damaged messages")
-            continue
-        yield piece
 
 
 def _packets(source: Source, trouble: Trouble) -> Iterator[Packet]:

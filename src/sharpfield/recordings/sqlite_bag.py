@@ -12,7 +12,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bag import Bag, Message, topic_of
 from sharpfield.recordings.blocks import head
 from sharpfield.recordings.recording import Trouble
-from sharpfield.recordings.unpacking import Damaged, unpacked
+from sharpfield.recordings.unpacking import Bytes, Damaged, unpacked
 
 MAGIC = b"SQLite format 3\0"
 FAILURES = (sqlite3.Error, UnicodeDecodeError)
@@ -66,7 +66,7 @@ def _connected(path: Path) -> sqlite3.Connection:
     return database
 
 
-def _plain(data: object) -> bytes:
+def _plain(data: object) -> Bytes:
     if not isinstance(data, bytes):
         raise Damaged("a message that is no bytes")
     return unpacked(data, "zstd") if data.startswith(ZSTD) else data

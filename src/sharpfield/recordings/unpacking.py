@@ -6,6 +6,8 @@ from typing import Any
 
 from sharpfield.core.extras import need
 
+Bytes = bytes | memoryview
+
 LIMIT = 2**28
 """No sound block is larger once unpacked (16 million events)."""
 
@@ -17,7 +19,7 @@ class Damaged(ValueError):
     """A part of a file is not what it should be; whoever reads the file skips it and counts."""
 
 
-def unpacked(data: bytes, packing: str) -> bytes:
+def unpacked(data: Bytes, packing: str) -> Bytes:
     """The block itself.
 
     Args:
@@ -33,20 +35,20 @@ def unpacked(data: bytes, packing: str) -> bytes:
     return _UNPACK[packing](data)
 
 
-def _none(data: bytes) -> bytes:
+def _none(data: Bytes) -> Bytes:
     return data
 
 
-def _bz2(data: bytes) -> bytes:
+def _bz2(data: Bytes) -> bytes:
     return _limited(bz2.BZ2Decompressor(), data, OSError)
 
 
-def _lz4(data: bytes) -> bytes:
+def _lz4(data: Bytes) -> bytes:
     frame: Any = need("lz4.frame", extra="io", purpose="reading a recording packed with LZ4")
     return _limited(frame.LZ4FrameDecompressor(), data, RuntimeError)
 
 
-def _zstd(data: bytes) -> bytes:
+def _zstd(data: Bytes) -> bytes:
     zstd: Any = need("zstandard", extra="io", purpose="reading a recording packed with Zstandard")
     try:
         with zstd.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as reader:
@@ -58,7 +60,7 @@ def _zstd(data: bytes) -> bytes:
     return found
 
 
-def _limited(decompressor: Any, data: bytes, failure: type[Exception]) -> bytes:
+def _limited(decompressor: Any, data: Bytes, failure: type[Exception]) -> bytes:
     def portions() -> Iterator[bytes]:
         yield decompressor.decompress(data, max_length=PORTION)
         while not decompressor.eof:
@@ -83,7 +85,7 @@ def _collected(portions: Iterator[bytes]) -> bytes:
     return found[0] if len(found) == 1 else b"".join(found)
 
 
-_UNPACK: dict[str, Callable[[bytes], bytes]] = {
+_UNPACK: dict[str, Callable[[Bytes], Bytes]] = {
     "none": _none,
     "bz2": _bz2,
     "lz4": _lz4,
