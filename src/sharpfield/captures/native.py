@@ -114,7 +114,10 @@ def describe(
         },
     }
     if frames is not None:
-        about["frames"] = {"encoding": capture.needed_frames.encoding, "each": frames}
+        held = capture.needed_frames
+        about["frames"] = {"encoding": held.encoding, "each": frames}
+        if held.exposure.row_delay_us:
+            about["frames"]["row_delay_us"] = float(held.exposure.row_delay_us)
     if depth is not None:
         about["depth"] = depth
     if capture.points is not None:

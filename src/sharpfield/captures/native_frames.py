@@ -3,6 +3,7 @@
 A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
 "none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
 defaults in brackets. `truth/depth.npy` and `truth/flow.npy` are of all frames, where known.
+`[frames] row_delay_us` (0) is that of a rolling shutter.
 """
 
 import re
@@ -77,7 +78,7 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
     Raises:
         CaptureError: A line or an image is missing or malformed, or images differ in size.
     """
-    about.expect_only("encoding", "each")
+    about.expect_only("encoding", "row_delay_us", "each")
     tables = about.tables("each")
     for table in tables:
         table.expect_only(*KEYS)
@@ -88,7 +89,8 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
     frames = Frames(
         images=images,
         exposure=Exposure(
-            *(_column([table.whole(key) for table in tables]) for key in ("open_us", "close_us"))
+            *(_column([table.whole(key) for table in tables]) for key in ("open_us", "close_us")),
+            row_delay_us=about.number("row_delay_us", 0.0),
         ),
         track=_column([table.whole("track", 0) for table in tables]),
         names=names,

@@ -82,6 +82,12 @@ class Recording:
     """Contrast threshold of both signs, instead of the sensor's own."""
     colour: bool = False
     """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
+    rolling_shutter_ms: float = 0.0
+    """How much later the last row of a frame is exposed than the first; scenes that stand still."""
+    lens: Literal["pinhole", "brown", "fisheye"] = "pinhole"
+    """A lens model; see `distortion`."""
+    distortion: tuple[float, ...] = ()
+    """Its coefficients, as OpenCV's: k1 k2 p1 p2 k3 of brown, k1 k2 k3 k4 of fisheye."""
     walk: Walked = WALKED
 
     def sensors(self, base: Rig, size: tuple[int, int]) -> Rig:
@@ -92,7 +98,15 @@ class Recording:
             events = replace(events, threshold_on=self.threshold, threshold_off=self.threshold)
         if self.colour:
             events, frames = replace(events, bayer="RGGB"), FrameSensor(encoding="linear")
-        return replace(base, size=size, frame_sensor=frames, event_sensor=events)
+        delay_us = 1000 * self.rolling_shutter_ms / max(size[1] - 1, 1)
+        return replace(
+            base,
+            size=size,
+            frame_sensor=replace(frames, row_delay_us=delay_us),
+            event_sensor=events,
+            lens=self.lens,
+            distortion=self.distortion,
+        )
 
 
 @dataclass(frozen=True)
@@ -157,8 +171,8 @@ def simulate(
 
     Args:
         out: Folder of the capture.
-        scene: A scene by name: garden, shelf, tiles, mobile; spinner, arm, jelly, glider, puppet, which
-            move and are seen from all around; or room, which is walked through with a depth camera.
+        scene: A scene by name: garden, shelf, tiles, mobile; spinner, arm, jelly, glider, puppet,
+            which move and are seen from all around; or room, walked through with a depth camera.
         size: Of the sensor, in pixels; by default 240x160, 64x64 for a moving scene, or 240x180
             for the room.
         layout: Files to write.
@@ -169,6 +183,12 @@ def simulate(
     """
     _known("scene", scene, [*SCENES, *MOVING_SCENES, ROOM])
     _known("motion", recording.motion, MOTIONS)
+    if recording.rolling_shutter_ms and scene in (ROOM, *MOVING_SCENES):
+        raise OptionError(
+            "a rolling shutter is simulated for scenes that stand still, before a camera",
+            got=f"--scene {scene}",
+            do=f"use one of {', '.join(SCENES)}",
+        )
     if scene == ROOM:
         rig = recording.sensors(ROOM_RIG, parse_size(size or ROOM_SIZE))
         if layout == "scannet":  # whose photos are sRGB

@@ -141,9 +141,14 @@ class Capture:
         return self.depth
 
     def frame_pose(self, frames: Int64[np.ndarray, "m"]) -> Float[Tensor, "m 3 4"]:
-        """World-from-camera poses in the middle of the exposures of some frames."""
+        """World-from-camera poses in the middle of the exposures of some frames.
+
+        With a rolling shutter, of that of the middle row.
+        """
         held = self.needed_frames
-        time = torch.as_tensor(self.clock.unit(held.exposure.middle_us[frames])).float()
+        exposure = held.exposure
+        middle = exposure.middle_us[frames] + round(exposure.readout_us(held.height) / 2)
+        time = torch.as_tensor(self.clock.unit(middle)).float()
         return self.trajectory.pose(time, torch.as_tensor(held.track[frames]))
 
     def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
@@ -180,6 +185,7 @@ class Capture:
                 continue
             member = np.flatnonzero(frames.track == track)
             opens, closes = frames.exposure.open_us[member], frames.exposure.close_us[member]
+            closes = closes + int(frames.exposure.readout_us(frames.height))
             wrong = member[(opens < known[0] - HELD_BACK_US) | (closes > known[1] + HELD_BACK_US)]
             if len(wrong):
                 i = int(wrong[0])

@@ -17,6 +17,9 @@ class Exposure:
 
     open_us: Int64[np.ndarray, "n"]
     close_us: Int64[np.ndarray, "n"]
+    row_delay_us: float = 0.0
+    """Each row opens and closes this much later than the one above: a rolling shutter. Times are
+    those of the first row."""
 
     def __post_init__(self) -> None:
         wrong = np.flatnonzero(self.close_us < self.open_us)
@@ -27,6 +30,12 @@ class Exposure:
                 where=f"frame {i}",
                 got=f"opens at {self.open_us[i]} us, closes at {self.close_us[i]} us",
                 do="check the order of the two columns of exposure times",
+            )
+        if self.row_delay_us < 0:
+            raise CaptureError(
+                "rows of a rolling shutter must follow each other downwards",
+                got=f"a row delay of {self.row_delay_us:g} us",
+                do="turn frames and events upside down",
             )
 
     def __len__(self) -> int:
@@ -47,6 +56,10 @@ class Exposure:
     def instant(self) -> Bool[np.ndarray, "n"]:
         """Whether a frame was taken at one instant, free of motion blur by construction."""
         return self.open_us == self.close_us
+
+    def readout_us(self, height: int) -> float:
+        """How much later the last of so many rows is exposed than the first."""
+        return self.row_delay_us * (height - 1)
 
     def window(self, frame: int) -> tuple[int, int]:
         """Opening and closing time of one frame, in us."""

@@ -17,10 +17,10 @@ class Views(Struct):
     along the last leading axis, `[..., k]`, with their weights.
     """
 
-    trailing: ClassVar = {"pose": 2, "corner": 1}
+    trailing: ClassVar = {"pose": 2, "corner": 1, "rows": 3}
 
     pose: Float[Tensor, "*b 3 4"]
-    """World-from-camera."""
+    """World-from-camera; with a rolling shutter, of the middle row."""
     time: Float[Tensor, "*b"]
     """0...1 of the capture."""
     weight: Float[Tensor, "*b"]
@@ -28,3 +28,5 @@ class Views(Struct):
     """Pixel (x, y) at the upper left of the part."""
     size: tuple[int, int]
     """Width and height of the part."""
+    rows: Float[Tensor, "*b q 3 4"] | None = None
+    """With a rolling shutter: from the first row of the whole image to the last, evenly in time."""

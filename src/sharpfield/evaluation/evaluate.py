@@ -32,6 +32,7 @@ from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.reference import Reference, held_out, trained_on
 from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
+from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics import Lpips, laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX
 from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, render_view, renderer_of
@@ -152,17 +153,20 @@ def _render(
 ) -> View:
     frames, own = capture.needed_frames, model.capture
     time = float(own.clock.unit(frames.exposure.middle_us)[reference.frame])
-    pose = how.poses.get(reference.frame)
-    if pose is None:
-        home = device_of(own.trajectory)
-        track = torch.tensor(int(frames.track[reference.frame]), device=home)
-        pose = own.trajectory.pose(torch.tensor(time, device=home), track).detach()
+    home, track = device_of(own.trajectory), int(frames.track[reference.frame])
+    when = torch.tensor(time, device=home), torch.tensor(track, device=home)
+    shutter = Rolling.of(capture, along=own.trajectory)
+    with torch.no_grad():
+        start = shutter.pose(*when)
+        pose = how.poses.get(reference.frame, start).to(device_of(model))
+        rows = moved_rows(shutter.rows(*when), start, pose)
     begun = perf_counter()
     seen = render_view(
         renderer_of(model),
         own.camera,
-        pose.to(device_of(model)),
+        pose,
         time,
+        rows=rows,
         chunk=how.chunk,
         progress=shown.within,
     )

@@ -31,6 +31,7 @@ from sharpfield.core.seed import numpy_generator
 from sharpfield.evaluation.device import device_of
 from sharpfield.evaluation.reference import held_out
 from sharpfield.geometry import cast, se3
+from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics import align, psnr
 from sharpfield.rendering.splat import whole
 from sharpfield.rendering.view import CHUNK, ViewRenderer, render_view, renderer_of
@@ -83,6 +84,8 @@ class _View:
     frame: int
     start: Pose
     time: float
+    rows: Float[Tensor, "q 3 4"] | None
+    """At the start, with a rolling shutter."""
     image: Float[Tensor, "h w c"]
 
 
@@ -180,10 +183,16 @@ def _views(model: Model, capture: Capture, start: Mapping[int, Pose]) -> list[_V
     own = _poses(model.capture, capture, frames)
     middle = model.capture.clock.unit(capture.needed_frames.exposure.middle_us[frames])
     views = []
+    shutter = Rolling.of(capture, along=model.capture.trajectory)
     for reference, pose, time in zip(references, own, middle, strict=True):
         assert reference.image is not None, "a held-out frame has its own image"
         begin = start.get(reference.frame, pose).to(home)
-        views.append(_View(reference.frame, begin, float(time), reference.image.to(home)))
+        track = torch.tensor(int(capture.needed_frames.track[reference.frame]))
+        with torch.no_grad():
+            rows = shutter.rows(torch.tensor(float(time)).to(home), track.to(home))
+        rows = moved_rows(rows, pose, begin)
+        image = reference.image.to(home)
+        views.append(_View(reference.frame, begin, float(time), rows, image))
     return views
 
 
@@ -237,7 +246,8 @@ def _error(
     row, column = (torch.from_numpy(part).to(twist.device) for part in divmod(pixels, camera.width))
     pose = se3.compose(view.start, se3.exp(twist))
     if isinstance(model, ViewRenderer):
-        seen = model.draw_views(whole(camera, pose, view.time))[0, row, column, 0]
+        rows = moved_rows(view.rows, view.start, pose)
+        seen = model.draw_views(whole(camera, pose, view.time, rows))[0, row, column, 0]
     else:
         xy = torch.stack([column, row], -1) + 0.5
         ones = torch.ones_like(xy[:, 0])
@@ -268,7 +278,8 @@ def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) ->
     found = []
     for view, twist in zip(views, twists.detach().clone(), strict=True):
         pose = se3.compose(view.start, se3.exp(twist))
-        light = render_view(renderer_of(model), model.capture.camera, pose, view.time)
+        rows = moved_rows(view.rows, view.start, pose)
+        light = render_view(renderer_of(model), model.capture.camera, pose, view.time, rows=rows)
         light = light.rgb.to(twist.device)
         picture = model.develop(light).clamp(0, 1)
         error = (picture - view.image).square().mean(-1).reshape(-1)
@@ -282,7 +293,7 @@ def _poses(model_side: Capture, capture: Capture, frames: Int64[np.ndarray, "m"]
     time = torch.from_numpy(model_side.clock.unit(held.exposure.middle_us[frames])).float()
     home = device_of(trajectory)
     track = torch.from_numpy(held.track[frames]).to(home)
-    return trajectory.pose(time.to(home), track).detach().cpu()
+    return Rolling.of(capture, along=trajectory).pose(time.to(home), track).detach().cpu()
 
 
 def _on_a_line(poses: Float[Tensor, "m 3 4"]) -> bool:

@@ -25,8 +25,10 @@ from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group
 from sharpfield.core.views import Views
 from sharpfield.formation.mix import mix
+from sharpfield.formation.row_clock import on_row_clock
 from sharpfield.formation.tone import tone_of
 from sharpfield.geometry.normalise import normalised
+from sharpfield.geometry.rolling import Rolling
 from sharpfield.recipes.looks import LookOptions, Looks
 from sharpfield.recipes.measured_depth import depth_error
 from sharpfield.recipes.splat_scene import GaussianOptions, SplatScene
@@ -82,22 +84,23 @@ class SplatModel(nn.Module):
         super().__init__()
         self.recipe, self.seed = recipe, seed
         self.options = recipe.looks
-        self.capture, self.change = normalised(_checked(capture))
+        self.capture, self.change = normalised(capture)
         if _motion_unknown(capture) and self.options.blur == "motion":
             self.capture = with_learned_shake(self.capture, seed)
         else:
             self.capture = with_learned_poses(self.capture, recipe.unknowns)
-        self.path = self.capture.trajectory
+        self.path, self.shutter = self.capture.trajectory, Rolling.of(self.capture)
+        aligned = with_row_clock(self.capture)
         self.encoding = capture.frames.encoding if capture.frames else "gamma2.2"
         self.tone = tone_of(self.encoding)
         self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
-        self.looks = Looks(self.options, self.capture, seed)
+        self.looks = Looks(self.options, aligned, seed)
         self.scene = SplatScene(
             recipe.gaussians,
             self.capture,
             starting_gaussians(
                 recipe.gaussians,
-                self.capture,
+                aligned,
                 self.unknowns.guess,
                 self.tone,
                 seed,
@@ -141,8 +144,12 @@ class SplatModel(nn.Module):
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
         only_events = events is not None and frames is None
         time = self.unknowns.on_time(look.time) if only_events else look.time
-        pose = self.path.pose(time, look.track)
-        light = self.scene.draw(Views(pose, time, look.weight, look.corner, look.size))
+        light = self.scene.draw(
+            Views(
+                *(self.shutter.pose(time, look.track), time, look.weight, look.corner, look.size),
+                rows=self.shutter.rows(time, look.track),
+            )
+        )
         terms = self.scene.idleness()
         if isinstance(frames, Pixels):
             exposed = replace(light, rgb=self._exposed(light.rgb, frames))
@@ -223,16 +230,13 @@ class OtherLens:
         return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
 
 
+def with_row_clock(capture: Capture) -> Capture:
+    """The capture with the events that are learned from on the clock of its rolling shutter."""
+    frames, events = capture.frames, capture.events
+    if frames is None or events is None:
+        return capture
+    return replace(capture, events=on_row_clock(events, frames.exposure.row_delay_us))
+
+
 def _motion_unknown(capture: Capture) -> bool:
     return capture.notes.get("motion") == "unknown" and capture.frames is not None
-
-
-def _checked(capture: Capture) -> Capture:
-    if capture.camera.lens != "pinhole":
-        raise OptionError(
-            "splats are drawn for lenses without distortion",
-            where=capture.name,
-            got=f"a {capture.camera.lens} lens",
-            do="undistort frames and events first, or use a recipe that renders rays",
-        )
-    return capture

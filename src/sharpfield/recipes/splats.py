@@ -12,14 +12,13 @@ import numpy as np
 import torch
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.exposure import Exposure
 from sharpfield.core.paper import Paper
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.event_term import thresholds_of
 from sharpfield.recipes.looks import LookOptions
 from sharpfield.recipes.pictures import sharp_pictures
-from sharpfield.recipes.splat_model import SplatModel
+from sharpfield.recipes.splat_model import SplatModel, with_row_clock
 from sharpfield.recipes.splat_scene import GaussianOptions
 from sharpfield.recipes.unknowns import UnknownOptions
 
@@ -183,10 +182,11 @@ def deblurred(capture: Capture, unknowns: UnknownOptions) -> Capture:
     frames = capture.needed_frames
     assert capture.needed_events is not None
     thresholds = FixedThresholds(*thresholds_of(capture, unknowns.threshold))
-    light = torch.from_numpy(sharp_pictures(capture, thresholds).light)
+    light = torch.from_numpy(sharp_pictures(with_row_clock(capture), thresholds).light)
     stored = tone_of(frames.encoding).encode(light).numpy()
     images = np.array(frames.images)
     images[capture.split.train] = np.rint(stored * frames.white).astype(images.dtype)
     middle = frames.exposure.middle_us
-    sharp = replace(frames, images=images, exposure=Exposure(middle, middle))
+    exposure = replace(frames.exposure, open_us=middle, close_us=middle)
+    sharp = replace(frames, images=images, exposure=exposure)
     return replace(capture, frames=sharp)

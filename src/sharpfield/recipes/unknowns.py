@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.exposure import Exposure
 from sharpfield.core.schedule import Group, Schedule, exponential
 from sharpfield.core.seed import generator
 from sharpfield.formation.response import FixedResponse, LogResidual, Response
@@ -173,7 +172,7 @@ def with_learned_shake(capture: Capture, seed: int) -> Capture:
     middle = frames.exposure.middle_us
     gap = int(np.diff(np.sort(middle)).min()) if len(middle) > 1 else capture.clock.span_us
     half = max(int(gap * VIRTUAL_SHUTTER / 2), 1)
-    exposure = Exposure(middle - half, middle + half)
+    exposure = replace(frames.exposure, open_us=middle - half, close_us=middle + half)
     opens, closes = (
         torch.from_numpy(capture.clock.unit(t)).float()
         for t in (exposure.open_us, exposure.close_us)

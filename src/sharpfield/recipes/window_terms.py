@@ -15,6 +15,9 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.formation.response import Response
 from sharpfield.formation.threshold import Thresholds
 
+TINY = 1e-12
+"""Mean square change of log light of a scene that does not move."""
+
 
 def changes(light: Radiance, events: EventPairs, response: Response) -> Float[Tensor, "m q h w c"]:
     """The change of log light over each window at every pixel.
@@ -51,15 +54,21 @@ def threshold_error(
 ) -> Float[Tensor, ""]:
     """Mean square of the number of events from the first instant of a look to its last.
 
-    What thresholds are learned from; the scene learns nothing. The number is taken to be off and
-    the light to be right: a scene that is still a little soft changes less than the light did, and
-    were its light taken to be off, that would be read as a smaller threshold. Over a long time,
-    events that were rounded away and light that came back matter least.
+    What thresholds are learned from; the scene learns nothing. They do not go down the slope of
+    this error, which would make them too small: a scene that is still a little soft changes less
+    than the light did. What it leaves out has little to do with what it shows, though, so that
+    both thresholds are right when the rest of the events does not change with the scene. Each is
+    asked to grow by the part that is missing where the scene changed in its direction. (The change
+    of the scene is an instrument for the counts, in the words of regression with errors in both.)
+    Over a long time, events that were rounded away and light that came back matter least.
     """
     whole = replace(
         events[:, 0], negative=events.negative.sum(1), positive=events.positive.sum(1), slack=None
     ).reshape(-1)
     negative, positive = thresholds(whole)
     total = change.detach().sum(1).reshape(-1)
-    off = (total - whole.measured(negative, positive)) / (negative * positive).sqrt()
-    return off.square().mean()
+    missing = total - whole.measured(negative.detach(), positive.detach())
+    asked = total * missing / total.square().mean().clamp_min(TINY)
+    pull = -(asked * torch.where(total > 0, positive, negative).log()).mean()
+    error = (missing / (negative * positive).detach().sqrt()).square().mean()
+    return error + pull - pull.detach()

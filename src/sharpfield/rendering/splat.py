@@ -18,6 +18,8 @@ from sharpfield.core.extras import need
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.views import Views
 from sharpfield.ops.rasterize import Canvas, rasterize
+from sharpfield.rendering.lens import flattened, resampled
+from sharpfield.rendering.rolling import row_shift
 
 
 @runtime_checkable
@@ -75,15 +77,23 @@ class Splatting:
 
         Raises:
             MissingExtra: On a graphics card, without gsplat.
+            OptionError: The lens sees too wide, see `flattened`.
         """
         if views.device.type == "cuda":
             # The definition would run, and need more memory than any card has.
             need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
         m, k = views.shape
         poses = views.pose.reshape(-1, 3, 4)
-        canvas = Canvas(
-            self.camera, views.corner.reshape(-1, 2), views.size, antialiased=self.antialiased
-        )
+        corner, where = views.corner.reshape(-1, 2), None
+        if self.camera.lens == "pinhole":
+            canvas = Canvas(self.camera, corner, views.size, antialiased=self.antialiased)
+        else:
+            flat = flattened(self.camera)
+            canvas, where = flat.canvas(corner, views.size, antialiased=self.antialiased)
+        if views.rows is not None:
+            rows = views.rows.reshape(m * k, -1, 3, 4)
+            late = row_shift(cloud.means, poses, rows, self.camera, canvas.camera)
+            shift = late if shift is None else shift + late
         drawn = rasterize(
             cloud.means,
             cloud.quaternions,
@@ -94,6 +104,8 @@ class Splatting:
             canvas,
             shift,
         )
+        if where is not None:
+            drawn = resampled(drawn, where)
         light, opacity = drawn.light, drawn.opacity
         if self.background:
             light = light + self.background * (1 - opacity[..., None])
@@ -107,8 +119,15 @@ class Splatting:
         return Radiance(apart(light), apart(depth), apart(opacity), weight)
 
 
-def whole(camera: Camera, pose: Float[Tensor, "3 4"], time: float) -> Views:
+def whole(
+    camera: Camera,
+    pose: Float[Tensor, "3 4"],
+    time: float,
+    rows: Float[Tensor, "q 3 4"] | None = None,
+) -> Views:
     """The full image of a camera, as the only view of its measurement: `[1, 1]`."""
+    if rows is not None:
+        rows = rows[None, None]
     one = pose.new_ones(1, 1)
     corner = torch.zeros(1, 1, 2, dtype=torch.int64)
-    return Views(pose[None, None], time * one, one, corner, camera.size)
+    return Views(pose[None, None], time * one, one, corner, camera.size, rows)

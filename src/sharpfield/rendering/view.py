@@ -51,6 +51,7 @@ def render_view(
     pose: Float[Tensor, "3 4"],
     time: float,
     *,
+    rows: Float[Tensor, "q 3 4"] | None = None,
     chunk: int = CHUNK,
     progress: Progress | None = None,
 ) -> Radiance:
@@ -61,6 +62,7 @@ def render_view(
         camera: Gives the size of the image.
         pose: World-from-camera, in the renderer's world; the rays are made on its device.
         time: 0...1 of the capture.
+        rows: Poses of a rolling shutter, see `Views`; only for what draws views.
         chunk: Rays rendered at once. Less needs less memory and gives the same image.
         progress: Called after each chunk.
 
@@ -69,7 +71,7 @@ def render_view(
     """
     pixels = camera.width * camera.height
     if isinstance(render, ViewRenderer):
-        seen = render.draw_views(whole(camera, pose, time))[0, :, :, 0].to("cpu")
+        seen = render.draw_views(whole(camera, pose, time, rows))[0, :, :, 0].to("cpu")
         if progress is not None:
             progress(pixels, pixels)
         return seen

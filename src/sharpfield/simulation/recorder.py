@@ -1,5 +1,7 @@
 """A frame camera and an event camera that look at the same pictures."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32, Shaped
 
@@ -26,7 +28,8 @@ class Recorder:
     ) -> None:
         delay = frame_sensor.row_delay_us
         middle = Exposure(exposure.middle_us, exposure.middle_us)
-        self._size, self._exposure, self._seed = size, exposure, seed
+        self._size, self._seed = size, seed
+        self._exposure = replace(exposure, row_delay_us=delay)
         self._blurry = Exposing(exposure, size, row_delay_us=delay)
         self._sharp = Exposing(middle, size, row_delay_us=delay)
         self._frame_sensor, self._event_sensor = frame_sensor, event_sensor

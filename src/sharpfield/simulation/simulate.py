@@ -6,8 +6,9 @@ camera's motion, but every eighth a sharp view at the middle of its slot, held o
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from math import ceil
 from os import cpu_count
 
 import numpy as np
@@ -48,6 +49,8 @@ class Timing:
     exceeded; 0 for even steps."""
     test_every: int = 8
     """Every how many frames one is sharp and held out, the first included; 0 for none."""
+    readout_us: int = 0
+    """The camera is watched for this much longer, while a rolling shutter reads the last frame."""
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.exposure_us < 0 or self.step_us < 1:
@@ -79,7 +82,12 @@ class Timing:
 
     def span_us(self) -> int:
         """Length of the recording."""
-        return (self.frames - 1) * self.interval_us + self.exposure_us + 2 * MARGIN_US
+        return (
+            (self.frames - 1) * self.interval_us
+            + self.exposure_us
+            + 2 * MARGIN_US
+            + self.readout_us
+        )
 
 
 @dataclass(frozen=True)
@@ -92,12 +100,17 @@ class Rig:
     event_sensor: EventSensor = field(default_factory=EventSensor)
     focal_of_width: float = FOCAL_OF_WIDTH
     """Focal length over the image width."""
+    lens: str = "pinhole"
+    distortion: tuple[float, ...] = ()
+    """See `Camera`; what the camera sees must lie before it."""
 
     def camera(self) -> Camera:
-        """A pinhole camera with square pixels."""
+        """A camera with square pixels."""
         width, height = self.size
         focal = self.focal_of_width * width
-        return Camera(width, height, focal, focal, width / 2, height / 2)
+        return Camera(
+            *(width, height, focal, focal, width / 2, height / 2), self.lens, self.distortion
+        )
 
 
 STANDARD_RIG, STANDARD_TIMING = Rig(), Timing()
@@ -126,6 +139,8 @@ def simulate(
     """
     place = scene(place) if isinstance(place, str) else place
     path = motion(path, seed) if isinstance(path, str) else path
+    readout = timing.readout_us or ceil(rig.frame_sensor.row_delay_us * (rig.size[1] - 1))
+    timing = replace(timing, readout_us=readout)
     camera, clock, exposure = rig.camera(), Clock(0, timing.span_us()), timing.exposure()
     recorder = Recorder(
         rig.size,

@@ -125,17 +125,17 @@ def _record(
 
 def _joined(tracks: Sequence[Frames]) -> Frames:
     """The frames of all tracks, track after track."""
-    times = [
+    opens, closes = (
         np.concatenate([getattr(one.exposure, end) for one in tracks])
         for end in ("open_us", "close_us")
-    ]
+    )
     columns = {
         name: np.concatenate([getattr(one, name) for one in tracks])
         for name in ("images", "truth", "truth_known", "depth", "flow")
     }
     return replace(
         tracks[0],
-        exposure=Exposure(*times),
+        exposure=Exposure(opens, closes),
         track=np.repeat(np.arange(len(tracks)), [len(one) for one in tracks]),
         names=tuple(f"v{k:02d}_{name}" for k, one in enumerate(tracks) for name in one.names),
         **columns,
