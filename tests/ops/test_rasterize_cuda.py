@@ -31,14 +31,19 @@ def fully_fused_projection(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """Camera-from-world matrices in, positions in pixels of the whole image out."""
     assert covars is None and (eps2d, near_plane) == (0.3, 0.01) and not opacities.requires_grad
-    lens = [CAMERA.fx_px, 0, CAMERA.cx_px, 0, CAMERA.fy_px, CAMERA.cy_px, 0, 0, 1]
+    rim = (width - CAMERA.width) // 2  # more than splats are shifted
+    assert (width, height) == (CAMERA.width + 2 * rim, CAMERA.height + 2 * rim) and rim in (0, 1)
+    camera = replace(
+        CAMERA, width=width, height=height, cx_px=CAMERA.cx_px + rim, cy_px=CAMERA.cy_px + rim
+    )
+    lens = [camera.fx_px, 0, camera.cx_px, 0, camera.fy_px, camera.cy_px, 0, 0, 1]
     assert torch.equal(Ks, torch.tensor(lens).reshape(1, 3, 3).expand(2, 3, 3))
     assert viewmats[:, 3].tolist() == [[0, 0, 0, 1]] * 2
     inward = viewmats[:, :3, :3]
     # Not the transpose: gradients of rotations also point to where they are none any more.
     centre = -torch.linalg.solve(inward, viewmats[:, :3, 3:])
     poses = torch.cat([inward.mT, centre], -1)
-    whole = Canvas(CAMERA, torch.zeros(2, 2, dtype=torch.int64), (width, height), True)
+    whole = Canvas(camera, torch.zeros(2, 2, dtype=torch.int64), (width, height), True)
     ones = torch.ones(len(means))
     seen = definition.project(means, quats, scales, ones, poses, whole)
     reach = torch.full((2, len(means), 2), 9, dtype=torch.int32)

@@ -8,6 +8,7 @@ those of its touches in a fixed order: no two threads ever write to the same pla
 not depend on how many there are.
 """
 
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.extras import need
 from sharpfield.ops.fast._kernel import memory, spread
 from sharpfield.ops.fast._splat_blend import LANES, TILE, blend, blend_back
@@ -64,13 +66,16 @@ def _(
         return rasterize.reference(*tensors, canvas, shift)
     gsplat = need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
     camera, (width, height) = canvas.camera, canvas.size
-    # All of the image is projected into, so that slopes end where those of the definition do.
+    # All of the image is projected into, so that slopes end where those of the definition do;
+    # and a rim around it from which splats may be shifted, as those beyond are left out.
+    rim = 0 if shift is None else _rim(shift.detach(), camera)
+    wide, high = camera.width + 2 * rim, camera.height + 2 * rim
     reach, centre, depth, conic, thinned = gsplat.fully_fused_projection(
-        means, None, quaternions, scales, *_as_matrices(poses, canvas), camera.width, camera.height,
+        means, None, quaternions, scales, *_as_matrices(poses, canvas, rim), wide, high,
         eps2d=WIDEN, near_plane=NEAR, calc_compensations=canvas.antialiased,
         opacities=opacities.detach(),
     )  # fmt: skip
-    centre = centre - canvas.corner.to(centre)[:, None]
+    centre = centre - (canvas.corner.to(centre) + rim)[:, None]
     if shift is not None:
         centre = centre + shift
     opacity = opacities.expand(len(poses), -1)
@@ -86,15 +91,22 @@ def _(
     return Drawn(sums[..., :-1], sums[..., -1], stopped[..., 0])
 
 
+def _rim(shift: Float[Tensor, "v n 2"], camera: Camera) -> int:
+    """Pixels by which splats are shifted, at most a quarter of the image."""
+    most = min(camera.width, camera.height) // 4
+    return min(ceil(float(shift.abs().clamp_max(most).max())), most) if shift.numel() else 0
+
+
 def _as_matrices(
-    poses: Float[Tensor, "v 3 4"], canvas: Canvas
+    poses: Float[Tensor, "v 3 4"], canvas: Canvas, rim: int
 ) -> tuple[Float[Tensor, "v 4 4"], Float[Tensor, "v 3 3"]]:
     """Camera-from-world, and the lens."""
     inward = poses[:, :, :3].mT
     last = poses.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(poses), 1, 4)
     camera_from_world = torch.cat([inward, -inward @ poses[:, :, 3:]], -1)
     camera = canvas.camera
-    lens = [[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1]]
+    middle = camera.cx_px + rim, camera.cy_px + rim
+    lens = [[camera.fx_px, 0, middle[0]], [0, camera.fy_px, middle[1]], [0, 0, 1]]
     matrix = poses.new_tensor(lens).expand(len(poses), 3, 3)
     return torch.cat([camera_from_world, last], 1), matrix
 
