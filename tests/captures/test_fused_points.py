@@ -60,6 +60,15 @@ def test_large_voxels_count_the_frames_that_saw_them(walled):
     assert cloud.views.max() == len(walled.split.train)
 
 
+def test_merging_again_and_again_changes_nothing(walled, monkeypatch):
+    whole = fuse_points(walled, stride=1, voxel=0.05)
+    monkeypatch.setattr("sharpfield.captures.fused_points.PENDING", 10)
+    often = fuse_points(walled, stride=1, voxel=0.05)
+    np.testing.assert_array_equal(often.views, whole.views)
+    np.testing.assert_allclose(often.points, whole.points, rtol=1e-6)
+    np.testing.assert_allclose(often.colours, whole.colours, atol=1e-6)
+
+
 def test_held_out_depth_is_left_alone_unless_told(walled):
     maps = walled.depth.stored.copy()
     maps[walled.split.test] = 500  # half a metre away: nothing else is

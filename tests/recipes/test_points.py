@@ -18,7 +18,7 @@ from sharpfield.recipes.point_growth import GrowthOptions
 from sharpfield.recipes.point_model import DrawOptions, PointModel
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.point_scene import MarchOptions
-from sharpfield.recipes.point_start import CloudOptions, typical_spacing
+from sharpfield.recipes.point_start import CloudOptions, first_cameras, typical_spacing
 from sharpfield.rendering.view import render_view
 from sharpfield.training import Options, adam, file_of, fit, train
 from tests.recipes.box import box
@@ -220,6 +220,25 @@ def test_spacing_is_that_of_a_regular_sheet():
     grid = np.stack(np.meshgrid(np.arange(60), np.arange(60)), -1).reshape(-1, 2)
     sheet = np.concatenate([0.05 * grid, np.zeros((3600, 1))], 1).astype(np.float32)
     assert typical_spacing(sheet) == pytest.approx(0.05, rel=0.3)
+
+
+def test_first_cameras_are_those_of_a_slow_loop():
+    capture = box()
+    random = np.random.default_rng(0)
+    positions = random.uniform(-2, 2, (50, 3)).astype(np.float32)
+    frames, directions = first_cameras(capture, torch.from_numpy(positions))
+    train = capture.split.train
+    poses = capture.frame_pose(train).double().numpy()
+    for place, frame, direction in zip(positions, frames.tolist(), directions, strict=True):
+        scores = []
+        for pose in poses:
+            way = place - pose[:, 3]
+            away = np.linalg.norm(way)
+            scores.append(away / 200 - way @ pose[:, 2] / away)
+        chosen = train.tolist().index(frame)
+        assert scores[chosen] == pytest.approx(min(scores), abs=1e-5)
+        way = place - poses[chosen, :, 3]
+        np.testing.assert_allclose(direction.numpy(), way / np.linalg.norm(way), atol=1e-5)
 
 
 def held_out(model: PointModel) -> float:

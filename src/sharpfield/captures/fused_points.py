@@ -13,14 +13,15 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.depth import DepthMaps
 from sharpfield.core.errors import CaptureError, OptionError
 
 PENDING = 3_000_000
-"""Voxels of single frames that are gathered before they are merged; bounds memory."""
+"""Voxels of single frames that are gathered before they are merged; bounds memory. As many as are
+known already may be gathered, so that time grows with the frames and not with their square."""
 
 BITS = 21
 """Of each coordinate in the number of a voxel: 2 million voxels along each axis."""
@@ -55,8 +56,24 @@ class _Sums:
 
     keys: Int64[np.ndarray, "v"]
     """Numbers of voxels, ascending."""
-    columns: Float64[np.ndarray, "v 11"]
+    columns: Float64[np.ndarray, "11 v"]
     """Summed place (3), weighted colour (3), normal (3), weight, count."""
+
+    def __len__(self) -> int:
+        """Number of voxels."""
+        return len(self.keys)
+
+
+@dataclass(frozen=True)
+class _Looking:
+    """Where the pixels of a depth map look, and which pixel of a frame shows the same."""
+
+    rays: Float32[np.ndarray, "h w 3"]
+    """With a z of 1."""
+    row: Int64[np.ndarray, "h w"]
+    column: Int64[np.ndarray, "h w"]
+    inside: Bool[np.ndarray, "h w"]
+    """Whether there is such a pixel."""
 
 
 def fuse_points(
@@ -86,28 +103,28 @@ def fuse_points(
     """
     if stride < 1 or not voxel > 0:
         raise OptionError("stride and voxel must be positive", got=f"{stride}, {voxel}")
-    depth = capture.needed_depth
+    depth, looking = capture.needed_depth, _looking(capture, stride)
     chosen = capture.split.train if frames == "train" else np.arange(len(depth))
-    rays = np.ascontiguousarray(depth.rays()[::stride, ::stride])
     poses = capture.frame_pose(chosen).detach().double().numpy()
     origin = poses[:, :, 3].mean(0) if len(poses) else np.zeros(3)
-    seen: list[_Sums] = []
+    known, seen = _merged([]), []
     for frame, pose in zip(chosen.tolist(), poses, strict=True):
         share = 1.0 if weight is None else float(weight[frame])
         measured = depth.at(frame)[::stride, ::stride]
         valid = (measured > max(nearest, 0)) & (measured < farthest)
-        columns, places = _seen(capture, frame, rays, np.where(valid, measured, 0), pose, share)
-        if len(places):
-            seen.append(_summed(_voxels(places - origin, voxel, capture.name), columns))
-        if sum(len(one.keys) for one in seen) > PENDING:
-            seen = [_merged(seen)]
-    if not seen:
+        columns = _seen(capture, frame, looking, np.where(valid, measured, 0), pose, share)
+        keys = _voxels(columns[:3].T - origin, voxel, capture.name)
+        seen.append(_summed(keys, columns))
+        if sum(map(len, seen)) > max(PENDING, len(known)):
+            known, seen = _merged([known, *seen]), []
+    known = _merged([known, *seen])
+    if not len(known):
         raise CaptureError(
             "the depth maps show no points",
             where=capture.name,
             got=f"{len(chosen)} frames, depth {nearest} to {farthest}",
         )
-    return _points(_merged(seen).columns)
+    return _points(known.columns)
 
 
 def as_points(
@@ -125,30 +142,34 @@ def as_points(
     return np.where(measured[..., None] > 0, points, np.nan)
 
 
+def _looking(capture: Capture, stride: int) -> _Looking:
+    """The same for all frames, since both cameras stand in one place."""
+    rays = np.ascontiguousarray(capture.needed_depth.rays()[::stride, ::stride])
+    xy = capture.camera.project(torch.from_numpy(rays.astype(np.float64))).numpy()
+    column, row = np.moveaxis(np.floor(xy).astype(np.int64), -1, 0)
+    width, height = capture.camera.size
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return _Looking(rays, row, column, inside)
+
+
 def _seen(
     capture: Capture,
     frame: int,
-    rays: Float32[np.ndarray, "h w 3"],
+    looking: _Looking,
     depth: Float32[np.ndarray, "h w"],
     pose: Float64[np.ndarray, "3 4"],
     share: float,
-) -> tuple[Float64[np.ndarray, "q 11"], Float64[np.ndarray, "q 3"]]:
-    """What one frame saw, a row of the columns of `_Sums` for each pixel; and where."""
-    inside = rays * depth[..., None]
-    normals = _normals(inside, depth)
-    known = depth > 0
-    inside, normals = inside[known].astype(np.float64), normals[known]
-    image = capture.needed_frames.images[frame]
-    xy = capture.camera.project(torch.from_numpy(inside)).numpy()
-    column, row = np.floor(xy).astype(np.int64).T
-    held = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
-    white = capture.needed_frames.white
-    colour = np.asarray(image)[row[held], column[held]].astype(np.float64) / white
-    places = inside[held] @ pose[:, :3].T + pose[:, 3]
-    count = len(places)
-    rgb = np.broadcast_to(colour, (count, 3)) * share
-    turned = normals[held] @ pose[:, :3].T
-    return np.hstack([places, rgb, turned, np.full((count, 1), share), np.ones((count, 1))]), places
+) -> Float64[np.ndarray, "11 q"]:
+    """What each pixel of one frame saw: the columns of `_Sums`, of a single pixel each."""
+    frames, inside = capture.needed_frames, looking.rays * depth[..., None]
+    held = (depth > 0) & looking.inside
+    colour = np.asarray(frames.images[frame])[looking.row[held], looking.column[held]]
+    columns = np.ones((11, len(colour)))
+    columns[:3] = pose[:, :3] @ inside[held].T + pose[:, 3:]
+    columns[3:6] = colour.T * (share / frames.white)
+    columns[6:9] = pose[:, :3] @ _normals(inside, depth)[held].T
+    columns[9] = share
+    return columns
 
 
 def _normals(
@@ -183,35 +204,35 @@ def _voxels(places: Float64[np.ndarray, "q 3"], voxel: float, where: str) -> Int
     return (cell[:, 0] << 2 * BITS) | (cell[:, 1] << BITS) | cell[:, 2]
 
 
-def _summed(keys: Int64[np.ndarray, "q"], columns: Float64[np.ndarray, "q 11"]) -> _Sums:
+def _summed(keys: Int64[np.ndarray, "q"], columns: Float64[np.ndarray, "11 q"]) -> _Sums:
     """Means over the pixels of one frame in each voxel: together they count as one view."""
-    sums = _gathered(keys, columns)
-    return _Sums(sums.keys, sums.columns / sums.columns[:, 10:])
+    sums = _merged([_Sums(keys, columns)])
+    return _Sums(sums.keys, sums.columns / sums.columns[10])
 
 
 def _merged(seen: list[_Sums]) -> _Sums:
-    return _gathered(
-        np.concatenate([one.keys for one in seen]), np.concatenate([one.columns for one in seen])
-    )
-
-
-def _gathered(keys: Int64[np.ndarray, "q"], rows: Float64[np.ndarray, "q 11"]) -> _Sums:
-    """Sums of the rows of each number."""
+    """One entry for each voxel, summed over all that have it; ascending."""
+    if not seen:
+        return _Sums(np.zeros(0, np.int64), np.zeros((11, 0)))
+    keys = np.concatenate([one.keys for one in seen])
     order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    first = np.flatnonzero(np.diff(ordered, prepend=ordered[:1] - 1))
-    return _Sums(ordered[first], np.add.reduceat(rows[order], first, axis=0))
+    keys = keys[order]
+    first = np.diff(keys, prepend=keys[:1] - 1) != 0
+    number = np.cumsum(first) - 1
+    sums = np.empty((11, int(first.sum())))
+    for i, row in enumerate(sums):  # one after the other: all of them sorted would be many
+        values = np.concatenate([one.columns[i] for one in seen])[order]
+        row[:] = np.bincount(number, values, len(row))
+    return _Sums(keys[first], sums)
 
 
-def _points(sums: Float64[np.ndarray, "v 11"]) -> FusedPoints:
+def _points(sums: Float64[np.ndarray, "11 v"]) -> FusedPoints:
     """Means of what `_Sums` sums."""
-    views = sums[:, 10:]
-    normals = sums[:, 6:9]
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    colours = sums[:, 3:6] / np.where(sums[:, 9:10] > 0, sums[:, 9:10], 1)
+    weight, views = sums[9], sums[10]
+    length = np.linalg.norm(sums[6:9], axis=0)
     return FusedPoints(
-        points=(sums[:, :3] / views).astype(np.float32),
-        colours=colours.astype(np.float32),
-        normals=(normals / np.where(length > 0, length, 1)).astype(np.float32),
-        views=np.rint(views[:, 0]).astype(np.int64),
+        points=(sums[:3] / views).T.astype(np.float32, order="C"),
+        colours=(sums[3:6] / np.where(weight > 0, weight, 1)).T.astype(np.float32, order="C"),
+        normals=(sums[6:9] / np.where(length > 0, length, 1)).T.astype(np.float32, order="C"),
+        views=np.rint(views).astype(np.int64),
     )

@@ -14,7 +14,8 @@ from depth where it is known, else from DIS flow; and comparisons with several n
 faintly with the picture's own variance, are brought to agree.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,8 +55,8 @@ SOFTEST_PX = 0.5
 Picture = UInt8[np.ndarray, "h w"]
 Response = Float32[np.ndarray, "h w"]
 Responses = Sequence[Response] | Mapping[int, Response]
-Seen = Callable[[int, int], Overlap]
-"""What two frames both show."""
+Seen = Callable[[int, int, Picture, Picture], Overlap]
+"""What two frames, given by their positions and pictures, both show."""
 
 
 @dataclass(frozen=True)
@@ -104,14 +105,13 @@ def quality(
     if overlap == "depth" and capture.depth is None:
         raise OptionError("the capture has no depth", where=capture.name, do="take overlap flow")
     by_depth = capture.depth is not None and overlap != "flow"
-    pictures = [grey(capture.needed_frames, int(i)) for i in chosen]
-    size = pictures[0].shape[1], pictures[0].shape[0]
 
-    def seen(i: int, j: int) -> Overlap:
+    def seen(i: int, j: int, one: Picture, other: Picture) -> Overlap:
         if by_depth:
-            return depth_overlap(capture, int(chosen[i]), int(chosen[j]), size)
-        return flow_overlap(pictures[i], pictures[j])
+            return depth_overlap(capture, int(chosen[i]), int(chosen[j]), one.shape[::-1])
+        return flow_overlap(one, other)
 
+    pictures = (grey(capture.needed_frames, int(i)) for i in chosen)
     if way == "published":
         scores = _published(pictures, seen)
     else:
@@ -152,26 +152,38 @@ def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.
     return weights
 
 
-def _published(pictures: Sequence[Picture], seen: Seen) -> Float64[np.ndarray, "m"]:
-    responses = [laplacian(picture) for picture in pictures]
-    pairs = [compared(i, i + 1, responses, seen(i, i + 1)) for i in range(len(pictures) - 1)]
-    own = float(responses[-1].astype(np.float64).var())
-    first = np.array([pair.first for pair in pairs] + [own])
-    return chained(first, np.array([pair.second for pair in pairs] + [own]))
+def _published(pictures: Iterable[Picture], seen: Seen) -> Float64[np.ndarray, "m"]:
+    current, following, before = [], [], None
+    for j, picture in enumerate(pictures):
+        response = laplacian(picture)
+        if before is not None:
+            both = seen(j - 1, j, before[0], picture)
+            pair = compared(j - 1, j, {j - 1: before[1], j: response}, both)
+            current.append(pair.first)
+            following.append(pair.second)
+        before = picture, response
+    own = 0.0 if before is None else float(before[1].astype(np.float64).var())
+    return chained(np.array([*current, own]), np.array([*following, own]))
 
 
 def _reconciled(
-    pictures: Sequence[Picture], seen: Seen, *, anchor: float
+    pictures: Iterable[Picture], seen: Seen, *, anchor: float
 ) -> Float64[np.ndarray, "m"]:
-    bent = [bending(picture) for picture in pictures]
+    own: tuple[list[float], list[float]] = ([], [])
     pairs: tuple[list[Comparison], list[Comparison]] = ([], [])
-    for i in range(len(pictures)):
-        for j in range(i + 1, min(i + 1 + NEIGHBOURS, len(pictures))):
-            both = seen(i, j)
-            for way, found in enumerate(pairs):
-                found.append(compared(i, j, {i: bent[i][way], j: bent[j][way]}, both))
-    own = [np.array([one[way].astype(np.float64).var() for one in bent]) for way in (0, 1)]
-    scores = [reconciled(own[way], pairs[way], anchor=anchor) for way in (0, 1)]
+    # Only the last few of a long video are held at once.
+    last: deque[tuple[int, Picture, tuple[Response, Response]]] = deque(maxlen=NEIGHBOURS)
+    for j, picture in enumerate(pictures):
+        bent = bending(picture)
+        for i, earlier, bent_earlier in last:
+            both = seen(i, j, earlier, picture)
+            for way in (0, 1):
+                responses = {i: bent_earlier[way], j: bent[way]}
+                pairs[way].append(compared(i, j, responses, both))
+        for way in (0, 1):
+            own[way].append(float(bent[way].astype(np.float64).var()))
+        last.append((j, picture, bent))
+    scores = [reconciled(np.array(own[way]), pairs[way], anchor=anchor) for way in (0, 1)]
     return np.sqrt(scores[0] * scores[1])
 
 

@@ -22,9 +22,9 @@ from sharpfield.formation.patch_kernel import (
     LearnedKernel,
     motion_kernels,
 )
-from sharpfield.metrics.quality import quality, quality_weights
 from sharpfield.recipes.hybrid_checkpoint import load_released
 from sharpfield.recipes.image_sources import SourceOptions
+from sharpfield.recipes.judged import Judge, frame_weights
 from sharpfield.recipes.picture_branch import PictureBranch
 from sharpfield.recipes.point_model import DrawOptions, PointModel
 from sharpfield.recipes.point_nerf import PointNeRF
@@ -97,7 +97,7 @@ class Hybrid(PointNeRF):
     drawn: DrawOptions = field(default_factory=lambda: DrawOptions(patches=49, side=8))
     sources: SourceOptions = field(default_factory=SourceOptions)
     blur: BlurOptions = field(default_factory=BlurOptions)
-    quality: Literal["even", "published", "auto", "pictures", "events"] = "published"
+    quality: Literal["even"] | Judge = "published"
     """How much each frame counts: all alike; as published; by events where there are any; by how
     sharp frames look; by events."""
     merge: int = 64
@@ -159,16 +159,11 @@ class Hybrid(PointNeRF):
         )
 
 
-def quality_of(
-    capture: Capture, kind: Literal["even", "published", "auto", "pictures", "events"]
-) -> Float[np.ndarray, "n"]:
+def quality_of(capture: Capture, kind: Literal["even"] | Judge) -> Float[np.ndarray, "n"]:
     """How much each frame counts, one on average; frames that are held out count one."""
-    weight = np.ones(len(capture.needed_frames))
     if kind == "even":
-        return weight
-    if kind == "published":
-        found = quality(capture, way="published").weights
-    else:
-        found = quality_weights(capture, source=kind)[capture.split.train]
-    weight[capture.split.train] = found / found.mean()
+        return np.ones(len(capture.needed_frames))
+    weight = frame_weights(capture, kind)
+    learned = capture.split.train
+    weight[learned] = weight[learned] / weight[learned].mean()
     return weight

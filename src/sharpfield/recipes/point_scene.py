@@ -13,12 +13,7 @@ from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields.neural_points import NeuralPoints
 from sharpfield.fields.point_networks import PointField, PointSizes
-from sharpfield.recipes.point_start import (
-    CloudOptions,
-    colours_seen,
-    first_cameras,
-    starting_cloud,
-)
+from sharpfield.recipes.point_start import CloudOptions, starting_cloud
 from sharpfield.rendering.points import Colour, Met, PointMarch
 
 VOXEL_OF_SPACING = 0.8
@@ -78,17 +73,11 @@ class PointScene(nn.Module):
         super().__init__()
         self.capture, self.seed = capture, seed
         start = starting_cloud(cloud, capture, seed, weight=weight)
-        positions = torch.from_numpy(np.ascontiguousarray(start.positions))
-        frame, direction = first_cameras(capture, positions)
-        if cloud.colours == "camera":
-            colours = colours_seen(capture, positions, frame)
-        else:
-            colours = torch.from_numpy(start.colours)
         voxel = march.voxel or VOXEL_OF_SPACING * start.spacing
         points = NeuralPoints.start(
-            positions,
-            colours,
-            direction,
+            torch.from_numpy(start.positions),
+            torch.from_numpy(start.colours),
+            torch.from_numpy(start.directions),
             channels=sizes.channels,
             cell=CELL * voxel,
             generator=generator(seed, 0, "descriptors"),

@@ -1,6 +1,6 @@
 """Where neural points start: on the surfaces that depth maps, or a sparse cloud, tell of."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
@@ -9,14 +9,15 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from sharpfield.captures.fused_points import fuse_points
+from sharpfield.captures.kept import kept
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import generator
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.pictures import Pictures
 from sharpfield.recipes.start_points import starting_points
 
-CHUNK = 1 << 16
-"""Points whose cameras are compared at once."""
+PAIRS = 1 << 20
+"""Of points and cameras, looked at at once: few enough to stay close to the processor."""
 
 FAR_OFF = 200.0
 """World units that count as much as a right angle to the axis, when a camera is chosen."""
@@ -26,6 +27,9 @@ GUESSED = 20_000
 
 FEW = 4.0
 """Mean number of points in occupied cubes two spacings wide."""
+
+HALVINGS = 16
+"""Of the interval in which the spacing is looked for: to a part in several thousand."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ class Cloud:
     positions: Float32[np.ndarray, "n 3"]
     colours: Float32[np.ndarray, "n c"]
     """As frames store them."""
+    directions: Float32[np.ndarray, "n 3"]
+    """Unit vectors from a camera that sees each."""
     spacing: float
     """Typical distance to the next point."""
 
@@ -70,7 +76,7 @@ def starting_cloud(
     *,
     weight: Float[np.ndarray, "a"] | None = None,
 ) -> Cloud:
-    """Points on the surfaces of a capture.
+    """Points on the surfaces of a capture; those of a long one are kept, see `captures.kept`.
 
     Args:
         options: How many, and from where.
@@ -78,7 +84,16 @@ def starting_cloud(
         seed: Of the run.
         weight: How much each frame counts for colours.
     """
-    channels = capture.needed_frames.channels
+    weights = None if weight is None else weight.tolist()
+    about = {"options": asdict(options), "seed": seed, "weight": weights}
+    found = kept(capture, "points", about, lambda: _found(options, capture, seed, weight))
+    return Cloud(found["positions"], found["colours"], found["directions"], float(found["spacing"]))
+
+
+def _found(
+    options: CloudOptions, capture: Capture, seed: int, weight: Float[np.ndarray, "a"] | None
+) -> dict[str, np.ndarray]:
+    """What `Cloud` holds."""
     if capture.depth is not None:
         positions, colours = _fused(options, capture, weight)
     else:
@@ -87,19 +102,28 @@ def starting_cloud(
         made = generator(seed, 0, "noise on points")
         drawn = torch.randn(positions.shape, generator=made).numpy()
         positions = positions + np.float32(options.noise) * drawn
-    colours = colours if channels == 3 else colours[:, :1]
-    return Cloud(positions, np.ascontiguousarray(colours), typical_spacing(positions))
+    frame, directions = first_cameras(capture, torch.from_numpy(positions))
+    if options.colours == "camera":
+        colours = colours_seen(capture, torch.from_numpy(positions), frame).numpy()
+    return {
+        "positions": positions,
+        "colours": np.ascontiguousarray(colours[:, : capture.needed_frames.channels]),
+        "directions": directions.numpy(),
+        "spacing": np.array(typical_spacing(positions)),
+    }
 
 
 def typical_spacing(positions: Float32[np.ndarray, "n 3"]) -> float:
     """Distance between neighbours of points on surfaces: half the cubes that hold four of them."""
     low = positions.min(0)
-    small, large = 1e-6, float((positions - low).max()) + 1e-6
-    for _ in range(24):
+    extent = float(np.ptp(positions, axis=0).max())
+    small, large = 1e-6, extent + 1e-6
+    for _ in range(HALVINGS):
         edge = (small * large) ** 0.5
         cell = ((positions - low) / edge).astype(np.int64)
         number = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-        crowded = len(positions) > FEW * len(np.unique(number))
+        occupied = 1 + np.count_nonzero(np.diff(np.sort(number)))
+        crowded = len(positions) > FEW * occupied
         small, large = (small, edge) if crowded else (edge, large)
     return (small * large) ** 0.5 / 2
 
@@ -115,16 +139,18 @@ def first_cameras(
     """
     train = torch.as_tensor(capture.split.train)
     pose = capture.frame_pose(capture.split.train).detach().float()
-    frames, directions = [], []
-    for part in positions.split(CHUNK):
-        way = part[:, None] - pose[:, :, 3]  # [n, a, 3]
-        away = way.norm(dim=-1)
-        along = (way * pose[:, :, 2]).sum(-1) / away.clamp_min(1e-6)
-        best = (away / FAR_OFF + 1.1 - along).argmin(-1)
-        row = torch.arange(len(part))
-        frames.append(train[best])
-        directions.append(way[row, best] / away[row, best, None].clamp_min(1e-6))
-    return torch.cat(frames), torch.cat(directions)
+    place, axis = pose[:, :, 3], pose[:, :, 2]
+    middle = place.mean(0)  # sums of squares lose less when they are small
+    square, own = (place - middle).square().sum(-1), ((place - middle) * axis).sum(-1)
+    best = []
+    for part in (positions - middle).split(max(PAIRS // len(train), 1)):
+        away = torch.addmm(square, part, (place - middle).T, alpha=-2)
+        away = away.add_(part.square().sum(-1, keepdim=True)).clamp_min_(1e-12).sqrt_()
+        along = torch.addmm(own, part, axis.T, beta=-1).div_(away)
+        best.append(along.sub_(away.div_(FAR_OFF)).argmax(-1))
+    chosen = torch.cat(best)
+    way = positions - place[chosen]
+    return train[chosen], way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)
 
 
 def colours_seen(
@@ -133,9 +159,10 @@ def colours_seen(
     """What one frame each shows where points are; 0 outside its image."""
     frames, camera = capture.needed_frames, capture.camera
     found = torch.zeros(len(positions), frames.channels)
-    for one in frame.unique().tolist():
-        here = torch.nonzero(frame == one)[:, 0]
-        pose = capture.frame_pose(np.array([one]))[0].detach().float()
+    order = frame.argsort(stable=True)
+    asked, counts = frame.unique(return_counts=True)
+    poses = capture.frame_pose(asked.numpy()).detach().float()
+    for one, pose, here in zip(asked.tolist(), poses, order.split(counts.tolist()), strict=True):
         seen = (positions[here] - pose[:, 3]) @ pose[:, :3]
         ahead = seen[:, 2] > 1e-6
         xy = camera.project(torch.where(ahead[:, None], seen, torch.tensor([0.0, 0.0, 1.0])))
