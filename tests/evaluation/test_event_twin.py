@@ -1,6 +1,7 @@
 """The twin of an event camera, where every event can be told in advance."""
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import torch
 
 from sharpfield.core import Camera, Capture, Clock, EventStream, Radiance, Rays, RunError
 from sharpfield.core.errors import OptionError
+from sharpfield.core.views import Views
 from sharpfield.evaluation.event_twin import (
     EventTwin,
     Pace,
@@ -130,6 +132,66 @@ def test_going_back_darkens_what_going_forth_brightened():
     )
     assert len(forth) == pytest.approx(len(back), abs=30)
     assert set(forth.p) == {1} and set(back.p) == {-1}
+
+
+def test_reversed_time_flips_signs_and_keeps_times():
+    """From a little above level 11 back to level 0, each level between is crossed again."""
+    sensor = replace(SENSOR, threshold_on=0.25, threshold_off=0.25)
+    forward = light_of(Wall(sliding()), on_track(Wall(sliding()), sliding(), 0))
+    end = 91_690  # level 11 is passed at 91_667
+
+    def backward(t_us: int) -> np.ndarray:
+        return forward(end - t_us)
+
+    ahead, back = (EventTwin(draw, (0, end), sensor).until(end + 1) for draw in (forward, backward))
+    assert set(ahead.p) == {1} and set(back.p) == {-1}
+    assert len(ahead) == len(back) == 11 * 30
+    here, there = ((part.x == 3) & (part.y == 2) for part in (ahead, back))
+    mirrored = np.sort(end - back.t_us[there])
+    np.testing.assert_allclose(mirrored[1:], ahead.t_us[here][:-1], atol=40)
+
+
+def test_counts_of_a_window_are_the_change_of_light_in_it():
+    """The published event frame, but for what a pixel carries over: less than a threshold."""
+    draw = light_of(Wall(sliding()), on_track(Wall(sliding()), sliding(), 0))
+    made = twin(sliding())
+    made.until(23_000)
+    part = made.until(61_000)
+    counted = np.zeros((5, 6))
+    np.add.at(counted, (part.y, part.x), np.where(part.p > 0, 0.25, -0.2))
+    change = np.log((draw(61_000) / draw(23_000)).mean(-1))
+    assert np.abs(counted - change).max() < 0.25
+    assert counted.mean() == pytest.approx(change.mean(), abs=0.13)
+
+
+def test_a_pixel_gathers_light_over_its_area():
+    """Of light exp(SLOPE x) over a pixel 1/40 wide, the mean is sinh(h)/h of the middle's."""
+    seat = on_track(Wall(sliding()), sliding(), 0)
+    whole = light_of(Wall(sliding()), seat, subpixels=16)(50_000)
+    middle = light_of(Wall(sliding()), seat)(50_000)
+    half = SLOPE / 40 / 2
+    np.testing.assert_allclose(whole / middle, np.sinh(half) / half, rtol=1e-4)
+    with pytest.raises(OptionError, match="at least one part"):
+        light_of(Wall(sliding()), seat, subpixels=0)
+
+
+def test_scenes_of_gaussians_are_seen_through_subpixels_unless_it_is_said():
+    class Splats(Wall):
+        sizes: ClassVar[list[tuple[int, int]]] = []
+
+        def through(self, camera: Camera) -> "Splats":
+            return self
+
+        def draw_views(self, views: Views) -> Radiance:
+            width, height = views.size
+            self.sizes.append((width, height))
+            light = torch.ones(1, height, width, 1)
+            return Radiance(light[..., None].expand(1, height, width, 1, 3), light, light, light)
+
+    seat = on_track(Splats(sliding()), sliding(), 0)
+    for subpixels in (None, 1, 3):
+        assert light_of(Splats(sliding()), seat, subpixels=subpixels)(0).shape == (5, 6, 3)
+    assert Splats.sizes == [(12, 10), (6, 5), (18, 15)]
 
 
 def test_steps_are_halved_where_light_changes_much():

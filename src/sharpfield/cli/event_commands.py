@@ -1,29 +1,32 @@
 """The command that puts an event camera into a trained scene."""
 
-import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
-from jaxtyping import Int32
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from tyro.conf import Positional
 
 from sharpfield.captures.pose_file import read_poses
 from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.event_output import (
+    Tell,
+    Wanted,
+    compare,
+    recorded_by,
+    recorded_in,
+    telling,
+    write_parts,
+)
 from sharpfield.cli.run_commands import Device
 from sharpfield.cli.runs import Opened, open_run
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.events import EventStream, merged
-from sharpfield.core.files import replacing
-from sharpfield.evaluation.event_agreement import agreement, side_by_side
-from sharpfield.evaluation.event_frames import count_events, windows, write_frames
+from sharpfield.core.events import EventStream
+from sharpfield.evaluation.event_frames import windows
+from sharpfield.evaluation.event_match import match
 from sharpfield.evaluation.event_twin import (
     EventTwin,
     Pace,
@@ -36,8 +39,7 @@ from sharpfield.evaluation.event_twin import (
     sized,
 )
 from sharpfield.simulation.event_sensor import SENSORS, SIZES, EventSensor
-from sharpfield.storage.event_formats import expect_format, exporting_events
-from sharpfield.storage.images import write_image
+from sharpfield.storage.event_formats import expect_format
 
 RECORDED = "recorded"
 OWN_SIZE = "sensor"
@@ -46,8 +48,7 @@ PIECE_MS = 10.0
 
 Start = Annotated[float | None, tyro.conf.arg(name="from", metavar="MS")]
 End = Annotated[float | None, tyro.conf.arg(name="to", metavar="MS")]
-Look = Callable[[int, int], None]
-Tell = Callable[[EventStream, int], EventStream]
+On = Annotated[float | None, tyro.conf.arg(name="on", metavar="MS")]
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,12 @@ class Place:
     trajectory: Path | None = None
     """A path of another camera: a text in TUM's format, or the trajectory.npz of a capture."""
     start_ms: Start = None
-    """The camera is switched on so long after its path begins."""
+    """Its events begin so long after its path."""
     end_ms: End = None
-    """And off so long after its path begins."""
+    """And end so long after its path begins."""
+    on_ms: On = None
+    """Switched on already then, in silence, so that its pixels carry levels of their own; if
+    nothing is said, when its events begin, or with a comparison as early as its path."""
     size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
     """Pixels of the sensor, or `sensor` for those of the one that is named; as recorded if nothing
     is said."""
@@ -76,8 +80,14 @@ class Pixels:
     and colour filter that the capture states."""
     threshold: float | None = None
     """Contrast threshold of both signs, instead of the sensor's own."""
+    match: bool = False
+    """Change the thresholds so that the scene makes as many events as were recorded, outside the
+    time that is rendered."""
     seed: int = 0
     """Of what differs from pixel to pixel, and of noise."""
+    subpixels: int | None = None
+    """Along each side of a pixel, whose light is their mean; 2 for Gaussians, otherwise 1, if
+    nothing is said."""
     step_ms: float = 4.0
     """Time between two rendered pictures where nothing changes."""
     shortest_ms: float = 1.0
@@ -87,7 +97,7 @@ class Pixels:
 
     def pace(self) -> Pace:
         """Steps of time."""
-        return Pace(_us(self.step_ms), self.most_change, _us(self.shortest_ms))
+        return Pace(us(self.step_ms), self.most_change, us(self.shortest_ms))
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,13 @@ class Windows:
     0.3 as in the published figures."""
     compare: bool = False
     """Say how the events agree with those that the capture's own camera recorded."""
+    against: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Say how they agree with the events of a file, on the clock of the capture."""
+
+    @property
+    def compares(self) -> bool:
+        """Whether anything is compared."""
+        return self.compare or self.against is not None
 
 
 PLACE, PIXELS, WINDOWS = Place(), Pixels(), Windows()
@@ -130,66 +147,102 @@ def events(
     _expect_sense(place, extra)
     console = Console()
     opened = open_run(run, capture=capture, device=device)
-    seat = _seat(opened, place, pixels.sensor)
-    recorded = _recorded(opened.capture, place.view or 0) if extra.compare else None
-    edges = windows(*seat.span_us, _us(PIECE_MS if extra.frames is None else extra.frames))
-    with _telling(console, seat.span_us) as (look, tell):
-        twin = EventTwin(
-            light_of(opened.model, seat, progress=look),
-            seat.span_us,
-            _sensor(opened.capture, pixels),
-            pace=pixels.pace(),
-            seed=pixels.seed,
-        )
-        seen = (tell(twin.until(edge), edge) for edge in edges)
-        made = _written(out, twin.until(seat.span_us[0]), seen, extra)
+    whole = _seat(opened, place, pixels.sensor)
+    seat = whole.between(*_ends(place))
+    span = _switched_on(whole, seat, place, extra)
+    recorded = _recorded(opened.capture, place, extra, span)
+    edges = windows(*seat.span_us, us(PIECE_MS if extra.frames is None else extra.frames))
+    sensor = _sensor(opened.capture, pixels)
+    if pixels.match:
+        sensor = _matched(console, opened, pixels, seat.span_us, sensor)
+    wanted = Wanted(
+        out,
+        None if extra.frames is None else out.with_name(f"{out.stem}-frames"),
+        extra.least_share,
+        keep=recorded is not None,
+    )
+    with telling(console, span) as (look, tell):
+        light = light_of(opened.model, seat, subpixels=pixels.subpixels, progress=look)
+        twin = EventTwin(light, span, sensor, pace=pixels.pace(), seed=pixels.seed)
+        made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
     say = f"{made.count:,} events, from {twin.looks} pictures, are in {out}"
     console.print(say, highlight=False)
-    if extra.frames is not None:
-        folder = out.with_name(f"{out.stem}-frames")
-        write_frames(folder, made.counts, least_share=extra.least_share)
-        console.print(f"{len(made.counts)} event frames are in {folder}", highlight=False)
+    if wanted.frames is not None:
+        console.print(f"{len(edges)} event frames are in {wanted.frames}", highlight=False)
     if recorded is not None:
-        _compare(console, out, (made.stream, recorded), [seat.span_us[0], *edges])
+        about = {
+            "threshold_on": sensor.threshold_on,
+            "threshold_off": sensor.threshold_off,
+            "matched": pixels.match,
+        }
+        streams = made.stream, recorded
+        compare(console, out, streams, [seat.span_us[0], *edges], about)
 
 
-@dataclass(frozen=True)
-class Made:
-    """What was rendered, as far as it is still needed."""
-
-    count: int
-    """Events."""
-    counts: list[Int32[np.ndarray, "h w 2"]]
-    """Event frames, if they are asked for."""
-    stream: EventStream
-    """All events, if they are to be compared."""
-
-
-def _written(out: Path, first: EventStream, parts: Iterator[EventStream], extra: Windows) -> Made:
-    """Write events as they come."""
-    counts, kept, total = [], [first], len(first)
-    with exporting_events(out, first[:0]) as append:
-        append(first)
-        for part in parts:
-            append(part)
-            total += len(part)
-            if extra.frames is not None:
-                counts.append(count_events(part))
-            if extra.compare:
-                kept.append(part)
-    return Made(total, counts, merged(kept))
+def _parts(twin: EventTwin, start_us: int, edges: list[int], tell: Tell) -> Iterator[EventStream]:
+    """Nothing, once all before the start was seen in silence; then the events of each window."""
+    before = twin.until(twin.span_us[0])
+    for edge in windows(twin.span_us[0], start_us, us(PIECE_MS)):
+        before = twin.until(edge)
+        tell(edge)
+    yield before[:0]
+    for edge in edges:
+        yield twin.until(edge)
+        tell(edge)
 
 
 def _seat(opened: Opened, place: Place, sensor: str) -> Viewpoint:
-    """Where to look from."""
+    """Where to look from, as long as the camera's path lasts."""
     if place.trajectory is not None:
         seat = on_path(opened.model, *read_poses(place.trajectory))
     else:
         seat = on_track(opened.model, opened.capture, place.view or 0)
-    if place.size is not None:
-        seat = replace(seat, camera=sized(seat.camera, _size(place.size, sensor)))
-    start, end = (None if ms is None else _us(ms) for ms in (place.start_ms, place.end_ms))
-    return seat.between(start, end)
+    if place.size is None:
+        return seat
+    return replace(seat, camera=sized(seat.camera, _size(place.size, sensor)))
+
+
+def _ends(place: Place) -> tuple[int | None, int | None]:
+    start, end = (None if ms is None else us(ms) for ms in (place.start_ms, place.end_ms))
+    return start, end
+
+
+def _switched_on(
+    whole: Viewpoint, seat: Viewpoint, place: Place, extra: Windows
+) -> tuple[int, int]:
+    """When the camera is switched on, and off."""
+    first, (start, end) = whole.span_us[0], seat.span_us
+    if place.on_ms is None:
+        return (first if extra.compares else start), end
+    on = first + us(place.on_ms)
+    if not first <= on <= start:
+        raise OptionError(
+            "a camera is switched on within its path, and not after its first event",
+            got=f"{place.on_ms:g} ms",
+            do=f"use 0 to {(start - first) / 1000:g}",
+        )
+    return on, end
+
+
+def _matched(
+    console: Console, opened: Opened, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
+) -> EventSensor:
+    """The sensor with thresholds that fit the scene; says what was found."""
+    found = match(
+        opened.model,
+        opened.capture,
+        away_from=span,
+        subpixels=pixels.subpixels,
+        pace=pixels.pace(),
+    )
+    matched = found.of(sensor)
+    console.print(
+        f"Thresholds x {found.on:.3f} to brighter, x {found.off:.3f} to darker match "
+        f"{found.recorded:,} recorded events outside the time rendered; without, the scene makes "
+        f"{found.unmatched / found.recorded:.1%} of them",
+        highlight=False,
+    )
+    return matched
 
 
 def _size(size: str, sensor: str) -> tuple[int, int]:
@@ -217,14 +270,13 @@ def _sensor(capture: Capture, pixels: Pixels) -> EventSensor:
     return replace(sensor, threshold_on=pixels.threshold, threshold_off=pixels.threshold)
 
 
-def _recorded(capture: Capture, view: int) -> EventStream:
-    """What the camera of a view recorded, also if it was held out."""
-    for stream in (capture.events, capture.test_events):
-        if stream is not None and len(own := stream.of_track(view)):
-            return own
-    raise OptionError(
-        "the capture has no events of this view to compare with", where=capture.name, got=view
-    )
+def _recorded(
+    capture: Capture, place: Place, extra: Windows, span_us: tuple[int, int]
+) -> EventStream | None:
+    """What to compare with, if anything."""
+    if extra.against is not None:
+        return recorded_in(extra.against, span_us)
+    return recorded_by(capture, place.view or 0) if extra.compare else None
 
 
 def _expect_sense(place: Place, extra: Windows) -> None:
@@ -234,53 +286,20 @@ def _expect_sense(place: Place, extra: Windows) -> None:
             got=f"--view {place.view} and --trajectory {place.trajectory}",
             do="leave one of them out",
         )
+    if extra.compare and extra.against is not None:
+        raise OptionError(
+            "events are compared with the capture's or with those of a file, not with both",
+            do="leave out --compare or --against",
+        )
     if extra.compare and (place.trajectory is not None or place.size is not None):
         raise OptionError(
             "only a camera of the capture, at its own size, has recorded events to compare with",
-            do="leave out --trajectory and --size, or --compare",
+            do="leave out --trajectory and --size, or name a recording with --against",
         )
     if not 0 <= extra.least_share <= 1:
         raise OptionError("a share lies between 0 and 1", got=extra.least_share)
 
 
-def _compare(
-    console: Console, out: Path, streams: tuple[EventStream, EventStream], edges_us: list[int]
-) -> None:
-    """Print how two streams agree; write it, and a picture of them, beside the events."""
-    found = agreement(*streams, edges_us)
-    table, picture = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
-    with replacing(table) as temporary:
-        temporary.write_text(json.dumps(asdict(found), indent=2) + "\n")
-    write_image(picture, side_by_side(*streams, edges_us))
-    for name, value in asdict(found).items():
-        shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-        console.print(f"  {name:<18} {shown}", highlight=False)
-    console.print(f"Recorded and rendered side by side: {picture}", highlight=False)
-
-
-@contextmanager
-def _telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, Tell]]:
-    """Progress through time, and within a picture: what to tell of either."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} ms"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
-        task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
-
-        def look(done: int, pixels: int) -> None:
-            progress.update(task, description=f"picture {done / pixels:4.0%}")
-
-        def tell(part: EventStream, t_us: int) -> EventStream:
-            progress.update(task, completed=(t_us - span_us[0]) / 1000)
-            return part
-
-        yield look, tell
-
-
-def _us(ms: float) -> int:
+def us(ms: float) -> int:
+    """Milliseconds in whole microseconds."""
     return round(1000 * ms)

@@ -10,17 +10,20 @@ A folder of them holds
 Source: EvDNeRF (WACV 2024), whose figures leave out pixels with few events (`without_few`).
 """
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from math import ceil, floor
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int32
+from jaxtyping import Int32, Int64
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.evaluation.pictures import FULL, colour_signs
-from sharpfield.evaluation.video import write_film
+from sharpfield.evaluation.video import Picture, write_film
 from sharpfield.ops.event_image import splat_nearest
 from sharpfield.storage.images import write_image
 
@@ -31,6 +34,9 @@ PUBLISHED_SHARE = 0.3
 
 RATE = 20.0
 """Windows per second of the film."""
+
+Append = Callable[[Int32[np.ndarray, "h w 2"]], None]
+"""Takes the counts of the next window."""
 
 
 def count_events(events: EventStream) -> Int32[np.ndarray, "h w 2"]:
@@ -70,7 +76,23 @@ def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
 def write_frames(
     folder: Path, counts: Sequence[Int32[np.ndarray, "h w 2"]], *, least_share: float = 0.0
 ) -> None:
-    """Write a folder of event frames; it appears whole or not at all.
+    """Write a folder of event frames that are there already; see `writing_frames`."""
+    with writing_frames(folder, len(counts), least_share=least_share) as append:
+        for part in counts:
+            append(part)
+
+
+@contextmanager
+def writing_frames(folder: Path, number: int, *, least_share: float = 0.0) -> Iterator[Append]:
+    """What takes the counts of each window; the folder appears whole, at the end, or not at all.
+
+    Memory is that of one frame: arrays grow on disk, and pictures, which share a scale, are drawn
+    at the end.
+
+    Args:
+        folder: Replaced if it holds event frames.
+        number: Of windows; as many must come.
+        least_share: See `without_few`; of frames and pictures, not of counts.
 
     Raises:
         OptionError: The folder is there and holds something else.
@@ -81,16 +103,59 @@ def write_frames(
             where=folder,
             do="choose another name for the events, or move it away",
         )
-    whole = np.stack(counts)
-    frames = without_few(signed(whole), least_share)
-    full = busy(frames)
-    pictures = [colour_signs(frame, full) for frame in frames]
     with replacing_folder(folder) as temporary:
-        np.save(temporary / COUNTS, whole)
-        np.save(temporary / FRAMES, frames)
-        for number, picture in enumerate(pictures):
-            write_image(temporary / f"{number:04d}.png", picture)
-        write_film(temporary / FILM, pictures, rate=RATE)
+        arrays: list[np.memmap] = []
+        found = [np.zeros(1, np.int64)]
+        done = itertools.count()
+
+        def append(counts: Int32[np.ndarray, "h w 2"]) -> None:
+            if not arrays:
+                shapes = {COUNTS: (number, *counts.shape), FRAMES: (number, *counts.shape[:2])}
+                arrays.extend(_on_disk(temporary / name, shape) for name, shape in shapes.items())
+            at = next(done)
+            frame = without_few(signed(counts), least_share)
+            arrays[0][at], arrays[1][at] = counts, frame
+            found[0] = _added(found[0], np.bincount(np.abs(frame).ravel()))
+
+        yield append
+        assert next(done) == number, "as many windows must come as were announced"
+        for array in arrays:
+            array.flush()
+        _draw(temporary, arrays[1], _full(found[0]))
+
+
+def _on_disk(path: Path, shape: tuple[int, ...]) -> np.memmap:
+    return np.lib.format.open_memmap(path, "w+", np.int32, shape)
+
+
+def _added(a: Int64[np.ndarray, "n"], b: Int64[np.ndarray, "m"]) -> Int64[np.ndarray, "k"]:
+    """Sum of two histograms of counts."""
+    total = np.zeros(max(len(a), len(b)), np.int64)
+    total[: len(a)] += a
+    total[: len(b)] += b
+    return total
+
+
+def _full(histogram: Int64[np.ndarray, "n"]) -> float:
+    """`busy` of the frames that a histogram of absolute counts was made of."""
+    ends = np.cumsum(np.concatenate([[0], histogram[1:]]))  # busy pixels up to each count
+    if not ends[-1]:
+        return 1.0
+    rank = FULL / 100 * (ends[-1] - 1)
+    low, high = np.searchsorted(ends, [floor(rank), ceil(rank)], "right")
+    return float(low + (rank - floor(rank)) * (high - low))
+
+
+def _draw(folder: Path, frames: Int32[np.ndarray, "n h w"], full: float) -> None:
+    """Pictures of frames, and a film of the pictures."""
+
+    def drawn() -> Iterator[Picture]:
+        for number, frame in enumerate(frames):
+            picture = colour_signs(np.asarray(frame), full)
+            write_image(folder / f"{number:04d}.png", picture)
+            yield picture
+
+    write_film(folder / FILM, drawn(), rate=RATE)
 
 
 def busy(frames: Int32[np.ndarray, "*n h w"]) -> float:

@@ -10,11 +10,15 @@ so a crossing falls at the exact time on that line; instants come closer where l
 A pixel compares with the level of its own last event, however long ago: what `until` tells in many
 windows is, event by event, what it tells in one.
 
+A pixel gathers light over its whole area. Gaussians are drawn wider than they are, so that none
+slips between pixel centres, and what is drawn is softer than what was learned; so the twin looks at
+a picture twice as large, and takes means (`subpixels`).
+
 Source: ESIM (Rebecq et al., CoRL 2018) for events from rendered light; EvDNeRF (WACV 2024) for
 rendering it from a learned scene, there as the change between two instants only.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -36,6 +40,9 @@ from sharpfield.simulation.events import EventPixels, Gap, joined, watch
 
 Draw = Callable[[int], Float32[np.ndarray, "h w c"] | Float32[np.ndarray, "h w"]]
 """Linear light at a time in us; the same whenever it is asked."""
+
+AREA = 2
+"""Subpixels along each side of a pixel, for scenes of Gaussians."""
 
 BEHIND_FILTERS = "RGGB"
 """Colour filter tile of a Color-DAVIS346, for events whose positions were rectified."""
@@ -84,21 +91,12 @@ class EventTwin:
         pace: Pace = PACE,
         seed: int = 0,
     ) -> None:
-        start, end = span_us
-        if end <= start:
-            raise OptionError("a stretch of time must end after its start", got=f"{span_us} us")
         self.sensor, self.span_us = sensor, span_us
         self._pixels = EventPixels(sensor, seed)
-        self._pictures = watch(
-            lambda t_us: brightness(_in_colour(draw(t_us)), sensor.bayer),
-            np.append(np.arange(start, end, pace.step_us, dtype=np.int64), end),
-            most_change=pace.most_change * min(sensor.threshold_on, sensor.threshold_off),
-            shortest_us=pace.shortest_us,
-            floor=sensor.floor,
-        )
+        self._pictures = pictures(draw, span_us, sensor, pace)
         self.looks = 0
         """Pictures seen."""
-        self._last_us = start - 1
+        self._last_us = span_us[0] - 1
         self._size = (0, 0)
         self._held: list[Gap] = []
 
@@ -119,6 +117,26 @@ class EventTwin:
         rest = found[told:]
         self._held = [Gap(rest.x, rest.y, rest.t_us, rest.p)]
         return found[:told]
+
+
+def pictures(
+    draw: Draw, span_us: tuple[int, int], sensor: EventSensor, pace: Pace
+) -> Iterator[tuple[int, Float32[np.ndarray, "h w"]]]:
+    """Times in us, and what falls on each pixel then, from the start of a span to its end.
+
+    Raises:
+        OptionError: The span is empty.
+    """
+    start, end = span_us
+    if end <= start:
+        raise OptionError("a stretch of time must end after its start", got=f"{span_us} us")
+    return watch(
+        lambda t_us: brightness(_in_colour(draw(t_us)), sensor.bayer),
+        np.append(np.arange(start, end, pace.step_us, dtype=np.int64), end),
+        most_change=pace.most_change * min(sensor.threshold_on, sensor.threshold_off),
+        shortest_us=pace.shortest_us,
+        floor=sensor.floor,
+    )
 
 
 @runtime_checkable
@@ -203,18 +221,31 @@ def on_path(
     return Viewpoint(model.capture.camera, path, 0, stamped.known_us(0))
 
 
-def light_of(model: Any, seat: Viewpoint, *, progress: Progress | None = None) -> Draw:
+def light_of(
+    model: Any,
+    seat: Viewpoint,
+    *,
+    subpixels: int | None = None,
+    progress: Progress | None = None,
+) -> Draw:
     """The light that a model sends to a viewpoint.
 
     Args:
         model: Trained; of rays or of whole views.
         seat: Where to look from.
+        subpixels: How many times wider and higher the picture is whose means are taken. None for
+            `AREA` where whole views are drawn through any lens, and otherwise 1.
         progress: Told how much of a picture is done.
 
     Raises:
-        OptionError: The model cannot be seen through this camera.
+        OptionError: The model cannot be seen through this camera, or there are no subpixels.
     """
-    renderer = _renderer(model, seat.camera)
+    subpixels = _usual_subpixels(model) if subpixels is None else subpixels
+    if subpixels < 1:
+        raise OptionError("a pixel has at least one part", got=f"{subpixels} subpixels")
+    width, height = seat.camera.size
+    camera = sized(seat.camera, (subpixels * width, subpixels * height))
+    renderer = _renderer(model, camera)
     clock, home = model.capture.clock, device_of(seat.path)
     track = torch.tensor(seat.track, device=home)
 
@@ -223,14 +254,15 @@ def light_of(model: Any, seat: Viewpoint, *, progress: Progress | None = None) -
         time = float(clock.unit(t_us))
         pose = seat.path.pose(torch.tensor(time, device=home), track).detach()
         lit = min(max(time, 0.0), 1.0)
-        rgb = render_view(renderer, seat.camera, pose, lit, progress=progress).rgb.numpy()
+        rgb = render_view(renderer, camera, pose, lit, progress=progress).rgb.numpy()
         if not np.isfinite(rgb).all():
             raise RunError(
                 "the model sends light that is not a number",
                 got=f"at {t_us} us",
                 do="train it again, at a lower rate",
             )
-        return np.maximum(rgb, 0).astype(np.float32)
+        parts = np.maximum(rgb, 0).reshape(height, subpixels, width, subpixels, -1)
+        return parts.mean((1, 3), dtype=np.float32)
 
     return draw
 
@@ -271,6 +303,10 @@ def sized(camera: Camera, size: tuple[int, int]) -> Camera:
         cx_px=large.cx_px - (large.width - size[0]) / 2,
         cy_px=large.cy_px - (large.height - size[1]) / 2,
     )
+
+
+def _usual_subpixels(model: Any) -> int:
+    return AREA if isinstance(model, ManyLenses) else 1
 
 
 def _renderer(model: Any, camera: Camera) -> Any:

@@ -1,7 +1,8 @@
 """npy and npz files, loaded with a clear message when they are missing, cut off or pickled."""
 
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ from jaxtyping import Shaped
 from sharpfield.core.errors import CaptureError
 
 Array = Shaped[np.ndarray, "..."]
+
+BLOCK = 1 << 20
+"""Bytes read at once."""
 
 PICKLED = "allow_pickle"
 """What numpy's message mentions when a file holds pickled objects."""
@@ -43,12 +47,45 @@ def load_arrays(path: Path) -> dict[str, Array]:
             raise _unreadable(path, error) from None
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
+class Column:
+    """A column of numbers that grows in a file of its own, which goes into an npz file later."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._kind = np.dtype(np.uint8)
+        self._count = 0
+
+    def append(self, values: Shaped[np.ndarray, "n"]) -> None:
+        """Add numbers; what comes first decides the type."""
+        if not self._count:
+            self._kind = values.dtype
+        with self._path.open("ab") as file:
+            file.write(values.astype(self._kind, copy=False).tobytes())
+        self._count += len(values)
+
+    def blocks(self) -> Iterator[bytes]:
+        """The whole column as an npy file, piece by piece."""
+        header = BytesIO()
+        about = {
+            "descr": np.lib.format.dtype_to_descr(self._kind),
+            "fortran_order": False,
+            "shape": (self._count,),
+        }
+        np.lib.format.write_array_header_1_0(header, about)
+        yield header.getvalue()
+        with self._path.open("rb") as file:
+            yield from iter(lambda: file.read(BLOCK), b"")
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Array | Column]) -> None:
     """Write an npz file; unlike `np.savez` it takes any name, also `file`."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, array, allow_pickle=False)
+                if isinstance(array, Column):
+                    member.writelines(array.blocks())
+                else:
+                    np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _load(path: Path) -> "Array | np.lib.npyio.NpzFile":

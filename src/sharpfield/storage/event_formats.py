@@ -5,19 +5,21 @@
     .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
     .raw    Prophesee's EVT3, see `storage.evt_writer`
 
-Whatever the format, the file appears whole, at the end, or not at all.
+Whatever the format, the file appears whole, at the end, or not at all, and memory is that of one
+piece.
 """
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing
-from sharpfield.storage.arrays import write_arrays
+from sharpfield.storage.arrays import Column, write_arrays
 from sharpfield.storage.event_writer import writing_events
 from sharpfield.storage.evt_writer import writing_evt
 
@@ -61,17 +63,18 @@ def _native(path: Path, like: EventStream) -> Iterator[Append]:
 
 @contextmanager
 def _arrays(path: Path, like: EventStream) -> Iterator[Append]:
-    parts = [like[:0]]
-    yield parts.append
-    columns = {
-        "x": np.concatenate([part.x for part in parts]),
-        "y": np.concatenate([part.y for part in parts]),
-        "t": np.concatenate([part.t_us for part in parts]),
-        "p": np.concatenate([part.p for part in parts]),
-    }
     about = {"tick_ns": 1000, "width": like.width, "height": like.height}
-    with replacing(path) as temporary:
-        write_arrays(temporary, columns | {name: np.array(told) for name, told in about.items()})
+    with replacing(path) as temporary, TemporaryDirectory(dir=path.parent, prefix=".") as folder:
+        columns = {name: Column(Path(folder) / name) for name in ("x", "y", "t", "p")}
+
+        def append(events: EventStream) -> None:
+            for name, column in columns.items():
+                column.append(getattr(events, "t_us" if name == "t" else name))
+
+        append(like[:0])
+        yield append
+        alone = {name: np.array(told) for name, told in about.items()}
+        write_arrays(temporary, columns | alone)
 
 
 @contextmanager
