@@ -12,6 +12,8 @@ enough; here neighbours are those that are truly nearest in the window.
 """
 
 import itertools
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -32,6 +34,9 @@ MOST_BRICKS = 1 << 28
 
 CHUNK = 1 << 14
 """Queries that the definition works on at once."""
+
+HELD = 1 << 16
+"""Cells whose surroundings are worked on at once: few enough to stay close to the processor."""
 
 
 @dataclass(frozen=True)
@@ -88,16 +93,15 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
     first = torch.nonzero(changed)[:, 0]
     held = key[first]
     count = torch.cat([first, first.new_tensor([len(key)])]).diff()
-    cell = _cell_of_key(held, bricks)
     marked = torch.zeros(bricks[0] * bricks[1] * bricks[2], dtype=torch.bool, device=key.device)
-    for step in itertools.product(sorted({-reach, reach}), repeat=3):
-        marked[_key(cell + cell.new_tensor(step), bricks) >> BITS] = True
+    corners = list(itertools.product(sorted({-reach, reach}), repeat=3))
+    for around in _around(held, bricks, corners):
+        marked[around >> BITS] = True
     number = torch.where(marked, marked.cumsum(0, dtype=torch.int32) - 1, -1).int()
     cells = int(marked.sum()) * BRICK
     near = torch.zeros(cells, dtype=torch.bool, device=key.device)
-    for step in window(reach):  # one after the other: together they would be many
-        one = _key(cell + cell.new_tensor(step), bricks)
-        near[number[one >> BITS].long() * BRICK + (one & BRICK - 1)] = True
+    for around in _around(held, bricks, window(reach)):
+        near[number[around >> BITS].long() * BRICK + (around & BRICK - 1)] = True
     counts = torch.zeros(cells + 1, dtype=torch.int64, device=key.device)
     counts[number[held >> BITS].long() * BRICK + (held & BRICK - 1) + 1] = count
     return Cells(
@@ -221,10 +225,26 @@ def chosen(
 
 def _key(cell: Int64[Tensor, "n 3"], bricks: list[int]) -> Int64[Tensor, "n"]:
     """One number for each cell, brick after brick."""
-    x, y, z = (cell >> HALF).unbind(-1)
-    brick = (x * bricks[1] + y) * bricks[2] + z
-    x, y, z = (cell & SIDE - 1).unbind(-1)
-    return brick << BITS | x << 2 * HALF | y << HALF | z
+    x, y, z = (_along(cell[:, axis], axis, bricks) for axis in range(3))
+    return x + y + z
+
+
+def _along(place: Int64[Tensor, "n"], axis: int, bricks: list[int]) -> Int64[Tensor, "n"]:
+    """What one coordinate of cells adds to their keys: keys are sums, for no bit is of two."""
+    apart = math.prod(bricks[axis + 1 :]) << BITS
+    return (place >> HALF) * apart + ((place & SIDE - 1) << HALF * (2 - axis))
+
+
+def _around(
+    keys: Int64[Tensor, "m"], bricks: list[int], steps: Sequence[tuple[int, ...]]
+) -> Iterator[Int64[Tensor, "_"]]:
+    """Keys of the cells some steps away, for a few cells at a time: all of them would be many."""
+    offsets = sorted({offset for step in steps for offset in step})
+    for begin in range(0, len(keys), HELD):
+        axes = enumerate(_cell_of_key(keys[begin : begin + HELD], bricks).unbind(-1))
+        moved = [{one: _along(x + one, axis, bricks) for one in offsets} for axis, x in axes]
+        for x, y, z in steps:
+            yield moved[0][x] + moved[1][y] + moved[2][z]
 
 
 def _cell_of_key(key: Int64[Tensor, "n"], bricks: list[int]) -> Int64[Tensor, "n 3"]:
