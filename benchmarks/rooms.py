@@ -1,6 +1,6 @@
 """Recipes for rooms on one walk, with the same time each; and the studies of the hybrid's paper.
 
-    python -m benchmarks.rooms [--study recipes|weights|capacity|points] [--minutes 6]
+    python -m benchmarks.rooms [--study recipes|weights|capacity|points] [--minutes 6 | --steps 1500]
 
 Without a capture (`--capture FOLDER`) the room is simulated: 120 frames of 240x180, 75 % blurred.
 `weights` compares frames weighted by quality with frames that all count alike; `capacity` gives the
@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--size", default="240x180")
     parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--steps", type=int, help="instead of minutes: the same on any machine")
     parser.add_argument("--out", type=Path, default=Path("runs/rooms"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu")
@@ -93,9 +94,10 @@ def main() -> None:
         timing = replace(RoomTiming(), frames=asked.frames)
         native.write(simulate_room(rig=rig, timing=timing, seed=asked.seed), source)
     capture, rows = read(source), []
+    budget = f"{asked.steps} steps" if asked.steps else f"{asked.minutes:g} minutes"
     for number, contender in enumerate(STUDIES[asked.study]):
         rows.append(_compete(contender, capture, source, out / f"{number}", asked))
-        facts = {"capture": capture.name, "minutes": asked.minutes, "seed": asked.seed}
+        facts = {"capture": capture.name, "budget": budget, "seed": asked.seed}
         print(save(f"rooms_{asked.study}", rows, {k: str(v) for k, v in facts.items()}))
     show(rows)
 
@@ -109,7 +111,7 @@ def _compete(
     )
     recipe = changed(recipe, contender.changes)
     started = Started(name, recipe, str(source.resolve()), asked.seed)
-    options = Options(minutes=asked.minutes)
+    options = Options(steps=asked.steps) if asked.steps else Options(minutes=asked.minutes)
     start(started, capture, run, options, device=asked.device, console=console)
     opened = open_run(run, device=asked.device)
     metrics = measure(opened, run, console, measuring=Measuring(train_views=1))
