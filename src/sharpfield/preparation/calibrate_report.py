@@ -55,7 +55,8 @@ def summary(capture: Capture, made: Calibration) -> dict[str, Any]:
         "known": None
         if known is None
         else {"negative": known.negative, "positive": known.positive},
-        "dead_us": made.dead_us,
+        "dead_us": round(made.dead_us, 1),
+        "late_ms": round(made.late_ms, 2),
         "explained": round(made.explained, 4),
         "residual": round(made.residual, 4),
         "drift_per_pair": round(made.drift, 4),
@@ -83,6 +84,8 @@ def as_text(about: dict[str, Any]) -> str:
     lines += [
         f"events explain the frames with a correlation of {about['explained']:.3f},"
         f" {about['equations']:,} equations of {about['pairs']} pairs of exposures",
+        f"pixels are dead for {about['dead_us']:.0f} us after an event, and"
+        f" {about['late_ms']:.1f} ms late",
         f"pixels: {pixels['judged']:,} judged, {pixels['deviating']} deviate,"
         f" {pixels['dead']} dead, {pixels['hot']} hot",
     ]

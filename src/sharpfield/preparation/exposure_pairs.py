@@ -162,7 +162,8 @@ def _weigh(offset, t_us, p, dead_us, weight):
         for i in range(offset[site] + 1, offset[site + 1]):
             if p[i] == p[i - 1]:
                 apart = t_us[i] - t_us[i - 1]
-                weight[i] = min(apart / max(apart - dead_us, 1.0), MOST_WEIGHT)
+                if apart > dead_us:  # what comes sooner has not been told by that rule
+                    weight[i] = min(apart / (apart - dead_us), MOST_WEIGHT)
 
 
 @njit(cache=True, nogil=True)
@@ -186,9 +187,10 @@ def _tell(sites, offset, t_us, p, weight, windows_us, thresholds, found):
                 until = t_us[event] if event < last else closes
                 until = min(until, closes)
                 lasts = until - now if closes > opens else 1
-                area += math.exp(level) * lasts
-                before += lasts * (p[event - 1] if event > first else 0)
-                after += lasts * (p[event] if event < last else 0)
+                light = math.exp(level) * lasts
+                area += light
+                before += light * (p[event - 1] if event > first else 0)
+                after += light * (p[event] if event < last else 0)
                 now = until
                 if now >= closes:
                     break
@@ -197,5 +199,5 @@ def _tell(sites, offset, t_us, p, weight, windows_us, thresholds, found):
                 event += 1
             length = closes - opens if closes > opens else 1
             found[site, 0] += side * np.log(area / length)
-            found[site, 3] += side * before / length
-            found[site, 4] += side * after / length
+            found[site, 3] += side * before / area
+            found[site, 4] += side * after / area
