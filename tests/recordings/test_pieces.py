@@ -69,6 +69,22 @@ def test_events_that_are_not_in_order_are_refused() -> None:
     )
 
 
+def test_most_events_outside_the_sensor_are_an_error() -> None:
+    x = np.where(np.arange(1000) < 600, 40, 3)
+    with pytest.raises(CaptureError) as refused:
+        list(joined(iter([piece(np.arange(1000), x)]), SIZE, where="a.raw", trouble=Trouble()))
+    assert str(refused.value) == (
+        "CaptureError: most events lie outside the sensor\n"
+        "  where  a.raw\n"
+        "  got    600 of 1,000, x up to 40 and y up to 0, of 12 x 10 pixels\n"
+        "  do     check the size of the sensor, and which column is which"
+    )
+    trouble = Trouble()
+    x = np.where(np.arange(1000) < 400, 40, 3)
+    (chunk,) = joined(iter([piece(np.arange(1000), x)]), SIZE, where="a.raw", trouble=trouble)
+    assert len(chunk) == 600 and str(trouble) == "400 events outside the sensor"
+
+
 def test_sizes() -> None:
     assert known_size((3, 4), None, "a") == known_size(None, (3, 4), "a") == (3, 4)
     with pytest.raises(CaptureError, match="does not say how large the sensor is"):

@@ -279,7 +279,6 @@ class _Ingest:
         """Keep what a pass through a recording left out; each pass meets the same."""
         for kind, count in recording.trouble.counts.items():
             self._left[kind] = max(self._left.get(kind, 0), count)
-        recording.trouble.counts.clear()
 
     def _crop(
         self, taken: Taken, exposure: Exposure, span: tuple[int, int]

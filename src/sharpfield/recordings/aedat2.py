@@ -20,7 +20,7 @@ Source: https://docs.inivation.com, "AEDAT 2.0"; the cameras' classes in jAER fo
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import no_type_check
@@ -139,6 +139,7 @@ def _records(layout: Layout) -> Iterator[tuple[UInt32[np.ndarray, "n"], Int64[np
 
 
 def _events(layout: Layout) -> Chunks:
+    layout = replace(layout, trouble=layout.trouble.anew("events"))
     return joined(_pieces(layout), layout.size, where=layout.path, trouble=layout.trouble)
 
 
@@ -156,6 +157,7 @@ def _pieces(layout: Layout) -> Iterator[Piece]:
 
 def _triggers(layout: Layout) -> Triggers:
     """The file tells when the input changed, and not which way: all edges are rising ones."""
+    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
     used, external = (0x8000_0400, 0x400) if layout.davis else (0xFFFF_8000, 0x8000)
     found = [t_us[address & np.uint32(used) == external] for address, t_us in _records(layout)]
     t_us = np.concatenate([np.empty(0, np.int64), *found])
@@ -164,6 +166,7 @@ def _triggers(layout: Layout) -> Triggers:
 
 def _frames(layout: Layout) -> Iterator[Frame]:
     """Pictures of a DAVIS, scaled to 16 bits."""
+    layout = replace(layout, trouble=layout.trouble.anew("frames"))
     reading = _Reading(layout)
     for address, t_us in _records(layout):
         samples = (address >> np.uint32(31) == 1) & (address >> np.uint32(10) & 3 != MOTION)

@@ -15,7 +15,7 @@ Source: https://docs.inivation.com, "AEDAT 3.1"; the event types of libcaer.
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, no_type_check
@@ -156,6 +156,7 @@ def _size(name: str) -> tuple[int, int] | None:
 
 
 def _events(layout: Layout, size: tuple[int, int]) -> Chunks:
+    layout = replace(layout, trouble=layout.trouble.anew("events"))
     return joined(_pieces(layout), size, where=layout.path, trouble=layout.trouble)
 
 
@@ -168,6 +169,7 @@ def _pieces(layout: Layout) -> Iterator[Piece]:
 
 
 def _triggers(layout: Layout) -> Triggers:
+    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
     found: list[tuple[int, int, int]] = []
     for packet in _packets(layout, SPECIAL, 8):
         for word, time in struct.iter_unpack("<Ii", packet.data):
@@ -179,6 +181,7 @@ def _triggers(layout: Layout) -> Triggers:
 
 
 def _frames(layout: Layout) -> Iterator[Frame]:
+    layout = replace(layout, trouble=layout.trouble.anew("frames"))
     for packet in _packets(layout, FRAME, FRAME_HEAD.size):
         for first in range(0, len(packet.data), packet.size):
             frame = _frame(packet.data[first : first + packet.size], packet.since_us)

@@ -13,7 +13,7 @@ Source: https://docs.inivation.com, "AEDAT 4.0", and the flatbuffer schemas of d
 import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import no_type_check
@@ -193,6 +193,7 @@ def _listed(layout: Layout) -> str:
 
 
 def _events(layout: Layout, number: int, size: tuple[int, int]) -> Chunks:
+    layout = replace(layout, trouble=layout.trouble.anew("events"))
     return joined(_pieces(layout, number), size, where=layout.path, trouble=layout.trouble)
 
 
@@ -208,6 +209,7 @@ def _pieces(layout: Layout, number: int) -> Iterator[Piece]:
 
 
 def _frames(layout: Layout, number: int) -> Iterator[Frame]:
+    layout = replace(layout, trouble=layout.trouble.anew("frames"))
     last_us: int | None = None
     for table in _packets(layout, [number], "FRME"):
         try:
@@ -248,6 +250,7 @@ def _frame(table: Table, trouble: Trouble) -> Frame | None:
 
 
 def _triggers(layout: Layout, numbers: Sequence[int]) -> Triggers:
+    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
     found: list[tuple[int, int, int]] = []
     for packet in _packets(layout, numbers, "TRIG"):
         try:

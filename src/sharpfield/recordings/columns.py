@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Int64, Shaped
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.pieces import expect_inside
 from sharpfield.recordings.recording import Chunks, Recording, Trouble
 from sharpfield.storage.event_columns import UNITS
 from sharpfield.storage.event_file import CHUNK, EventFile
@@ -38,7 +39,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
 
     def events() -> Chunks:
         with open_file() as opened:
-            yield from _chunks(opened, trouble, whole=whole)
+            yield from _chunks(opened, trouble.anew("events"), whole=whole)
 
     return Recording(
         path, layout, size=size, events=events, bayer=bayer, trouble=trouble, notes=notes
@@ -47,6 +48,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
 
 def _chunks(file: EventFile, trouble: Trouble, *, whole: bool) -> Chunks:
     before: int | None = None
+    outside = 0
     for first in range(0, len(file), CHUNK):
         last = min(first + CHUNK, len(file))
         try:
@@ -57,7 +59,12 @@ def _chunks(file: EventFile, trouble: Trouble, *, whole: bool) -> Chunks:
             trouble.note("events from a damaged part onwards", len(file) - first)
             return
         kept = _inside(stored, file.size, whole=whole)
-        trouble.note("events outside the sensor", int((~kept).sum()))
+        outside += (left_out := int((~kept).sum()))
+        trouble.note("events outside the sensor", left_out)
+        if left_out:
+            assert file.size is not None, "the size was expected when the file was opened"
+            column, row = (float(np.nan_to_num(stored[name]).max()) for name in ("x", "y"))
+            expect_inside(outside, last, (column, row), file.size, file.path)
         columns = {name: column[kept] for name, column in stored.items()}
         if whole:
             columns |= {name: columns[name].astype(np.uint16) for name in ("x", "y")}

@@ -68,9 +68,9 @@ def open_dat(path: Path | str, *, size: tuple[int, int] | None = None) -> Record
 
     def events() -> Chunks:
         assert size is not None, "a file of events has a size"
-        trouble.counts.clear()
-        pieces = _pieces(records(), PLACES[version], trouble)
-        return joined(pieces, size, where=path, trouble=trouble)
+        noted = trouble.anew("events")
+        pieces = _pieces(records(), PLACES[version], noted)
+        return joined(pieces, size, where=path, trouble=noted)
 
     def triggers() -> Triggers:
         return _edges(b"".join(records()))

@@ -93,8 +93,8 @@ def open_evt(
         return blocks(path, header.length)
 
     def events() -> Chunks:
-        trouble.counts.clear()
-        for part in decoded(chosen, words(), size, where=path, trouble=trouble):
+        noted = trouble.anew("events")
+        for part in decoded(chosen, words(), size, where=path, trouble=noted):
             yield replace(part, t_us=part.t_us + origin_us if origin_us else part.t_us, bayer=bayer)
 
     def triggers() -> Triggers:

@@ -47,7 +47,7 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
         )
     size = known_size(None, size, path)
 
-    def pieces() -> Iterator[Piece]:
+    def pieces(noted: Trouble) -> Iterator[Piece]:
         rest, paused_us = b"", 0
         for block in chain(blocks(path), [b""]):
             rest += block
@@ -59,10 +59,10 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
             t_us = ((high & 0x7F) << 16 | middle << 8 | low) + pauses
             p = np.where(high >> 7, 1, -1).astype(np.int8)
             yield Piece(x.astype(np.uint16), y.astype(np.uint16), t_us, p)[y != NO_ROW]
-        trouble.note("torn records", int(len(rest) > 0))
+        noted.note("torn records", int(len(rest) > 0))
 
     def events() -> Chunks:
-        trouble.counts.clear()
-        return joined(pieces(), size, where=path, trouble=trouble)
+        noted = trouble.anew("events")
+        return joined(pieces(noted), size, where=path, trouble=noted)
 
     return Recording(path, "N-MNIST", size=size, events=events, trouble=trouble)

@@ -25,7 +25,7 @@ from jaxtyping import Shaped
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.columns import recording_of
-from sharpfield.recordings.recording import Chunks, Recording
+from sharpfield.recordings.recording import Chunks, Recording, Trouble
 from sharpfield.storage.event_columns import ZippedColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
 from sharpfield.storage.event_layouts import UNREADABLE_NPZ, open_events
@@ -102,8 +102,11 @@ def open_npz_folder(
         unit = "ns"
     opened = [open_npz(file, unit=unit, size=size) for file in files]
 
+    trouble = Trouble()
+
     def events() -> Chunks:
         before: int | None = None
+        noted = trouble.anew("events")
         for file in opened:
             for chunk in file.chunks():
                 if before is not None and chunk.t_us[0] < before:
@@ -116,11 +119,10 @@ def open_npz_folder(
                 before = int(chunk.t_us[-1])
                 yield chunk
             for kind, count in file.trouble.counts.items():
-                first.trouble.note(kind, count)
-            file.trouble.counts.clear()
+                noted.note(kind, count)
 
-    first = replace(opened[0], trouble=type(opened[0].trouble)())
-    return replace(first, path=path, layout="folder of npz", events=events)
+    layout = "folder of npz"
+    return replace(opened[0], path=path, layout=layout, events=events, trouble=trouble)
 
 
 def open_npy(
@@ -259,7 +261,7 @@ def _may_be(array: Array, order: str) -> bool:
         x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
         if not (np.isin(p, (-1, 0, 1)).all() and np.isfinite(np.stack([x, y])).all()):
             return False
-        if t[0] < before or (np.diff(t) < 0).any():
+        if t[0] < before or (t[1:] < t[:-1]).any():
             return False
         before = t[-1]
     return True

@@ -24,6 +24,10 @@ BACK_EVENTS, BACK_SHARE = 100, 0.01
 """Some cameras now and then deliver an event late. More than this many, and more than this share
 of all, mean that the file is not in the order of time at all."""
 
+OUTSIDE_EVENTS, OUTSIDE_SHARE = 100, 0.5
+"""Damage puts events outside the sensor. More than this many, and more than this share of all, mean
+that the size is that of another sensor, or that the columns are others."""
+
 
 @dataclass(frozen=True)
 class Piece:
@@ -56,7 +60,8 @@ def joined(
         trouble: Is told what was dropped.
 
     Raises:
-        CaptureError: The events are not in the order of time.
+        CaptureError: The events are not in the order of time, or most of them lie outside the
+            sensor.
     """
     gate = _Gate(size, where, trouble)
     waiting: list[Piece] = []
@@ -105,13 +110,38 @@ def known_size(
     return size
 
 
+def expect_inside(
+    outside: int, count: int, furthest: tuple[float, float], size: tuple[int, int], where: object
+) -> None:
+    """Make sure that the size is that of the sensor.
+
+    Args:
+        outside: How many events lie outside.
+        count: Of how many.
+        furthest: The largest column and row of these.
+        size: Width and height of the sensor.
+        where: The file, for the message.
+
+    Raises:
+        CaptureError: Most events lie outside.
+    """
+    if outside > max(OUTSIDE_EVENTS, OUTSIDE_SHARE * count):
+        raise CaptureError(
+            "most events lie outside the sensor",
+            where=where,
+            got=f"{outside:,} of {count:,}, x up to {furthest[0]:g} and y up to {furthest[1]:g},"
+            f" of {size[0]} x {size[1]} pixels",
+            do="check the size of the sensor, and which column is which",
+        )
+
+
 class _Gate:
     """Lets through what lies on the sensor and does not go back in time."""
 
     def __init__(self, size: tuple[int, int], where: object, trouble: Trouble) -> None:
         self._size, self._where, self._trouble = size, where, trouble
         self._last_us = np.iinfo(np.int64).min
-        self._seen = self._back = 0
+        self._seen = self._back = self._outside = 0
 
     def passed(self, piece: Piece) -> Piece:
         """The sound events of the next piece."""
@@ -129,6 +159,10 @@ class _Gate:
         self._trouble.note("events outside the sensor", outside)
         self._trouble.note("events earlier than those before them", back)
         self._back += back
+        self._outside += outside
+        count = self._seen + self._outside + int(keep.sum())
+        furthest = float(piece.x.max()), float(piece.y.max())
+        expect_inside(self._outside, count, furthest, self._size, self._where)
         if self._back > max(BACK_EVENTS, BACK_SHARE * (self._seen + len(piece))):
             width, height = self._size
             inside = (piece.x < width) & (piece.y < height)

@@ -49,14 +49,36 @@ class Triggers:
 
 @dataclass
 class Trouble:
-    """What was left out while reading, counted by kind."""
+    """What was left out while reading, counted by kind.
 
-    counts: dict[str, int] = field(default_factory=dict)
+    Events, frames and triggers are read each by itself, and as often as one likes. A reading begins
+    with `anew`, and what it notes takes the place of what the reading before it had noted: however
+    often a recording is read, the same is told once. So is what several readings meet, a torn end.
+    """
+
+    noted: dict[str, int] = field(default_factory=dict)
+    """What was noted here, apart from readings."""
+    readings: dict[str, "Trouble"] = field(default_factory=dict)
+    """The latest of each kind, by name."""
+
+    def anew(self, reading: str) -> "Trouble":
+        """What takes the notes of a reading that begins: "events", "frames", "triggers"."""
+        self.readings[reading] = Trouble()
+        return self.readings[reading]
 
     def note(self, kind: str, count: int = 1) -> None:
         """Say that something was left out, in the plural: "events outside the sensor"."""
         if count:
-            self.counts[kind] = self.counts.get(kind, 0) + count
+            self.noted[kind] = self.noted.get(kind, 0) + count
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many of each kind were left out; where readings differ, the most."""
+        found = dict(self.noted)
+        for reading in self.readings.values():
+            for kind, count in reading.counts.items():
+                found[kind] = max(found.get(kind, 0), count)
+        return found
 
     def __str__(self) -> str:
         """One line, "3 events outside the sensor, 1 torn packets"; empty if all was sound."""
@@ -81,7 +103,7 @@ class Recording:
     bayer: str = ""
     """Colour filter tile of the raw sensor, e.g. "RGGB"; "" if mono or not known."""
     trouble: Trouble = field(default_factory=Trouble)
-    """What reading has left out so far."""
+    """What reading has left out so far; reading again tells the same, and not twice as much."""
     notes: dict[str, str] = field(default_factory=dict)
     """What the header says besides: camera, serial number, date, as the file spells it."""
 

@@ -220,6 +220,7 @@ def _shift_us(source: Source) -> int:
 
 
 def _events(source: Source, trouble: Trouble) -> Chunks:
+    trouble = trouble.anew("events")
     if not source.encoding:
         messages = source.bag.messages([source.topic], trouble)
         pieces = event_arrays(messages, source.bag.topics[source.topic], trouble)
@@ -264,6 +265,7 @@ def _bayer(bag: Bag, topic: str) -> str:
 
 
 def _frames(bag: Bag, topic: str, exposure_us: int, trouble: Trouble) -> Iterator[Frame]:
+    trouble = trouble.anew("frames")
     ends = _exposure_ends(bag, f"{topic}/exposure", trouble)
     before = None
     for found in _images(bag, topic, trouble):

@@ -68,8 +68,8 @@ UNREADABLE = (
 )
 """What an archive that is damaged, locked or packed in an odd way raises."""
 
-Blocks = Callable[[], Iterator[bytes]]
-"""Starts reading the text anew."""
+Blocks = Callable[[Trouble], Iterator[bytes]]
+"""Starts reading the text anew, and notes what is damaged."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +104,8 @@ def open_text(
     """
     path = Path(path)
     trouble = Trouble()
-    read = _zipped(path, trouble) if head(path, 4) == b"PK\x03\x04" else lambda: blocks(path)
-    start = next(read(), b"")
+    read = _zipped(path) if head(path, 4) == b"PK\x03\x04" else lambda noted: blocks(path)
+    start = next(read(Trouble()), b"")
     begin = _beginning(start[:WHOLE_HEAD])
     order = begin.columns or columns or USUAL
     if sorted(order) != sorted(USUAL):
@@ -123,9 +123,9 @@ def open_text(
     layout = np.array([*(order.index(name) for name in USUAL), POWERS[unit]], np.int64)
 
     def events() -> Chunks:
-        trouble.counts.clear()
-        pieces = _pieces(_from(begin.length, read()), layout, path, trouble)
-        return joined(pieces, size, where=path, trouble=trouble)
+        noted = trouble.anew("events")
+        pieces = _pieces(_from(begin.length, read(noted)), layout, path, noted)
+        return joined(pieces, size, where=path, trouble=noted)
 
     return Recording(path, "text", size=size, events=events, trouble=trouble)
 
@@ -217,7 +217,7 @@ def _from(start: int, data: Iterator[bytes]) -> Iterator[bytes]:
         start = max(start - len(block), 0)
 
 
-def _zipped(path: Path, trouble: Trouble) -> Blocks:
+def _zipped(path: Path) -> Blocks:
     """What reads the only text of an archive.
 
     Raises:
@@ -240,12 +240,12 @@ def _zipped(path: Path, trouble: Trouble) -> Blocks:
             "cannot read the archive", where=path, got=error, do="copy or pack it again"
         ) from None
 
-    def read() -> Iterator[bytes]:
+    def read(noted: Trouble) -> Iterator[bytes]:
         try:
             with zipfile.ZipFile(path) as archive, archive.open(named[0]) as file:
                 while block := file.read(BLOCK):
                     yield block
         except UNREADABLE:
-            trouble.note("damaged archives, read up to the damage")
+            noted.note("damaged archives, read up to the damage")
 
     return read

@@ -58,7 +58,7 @@ def open_video(path: Path, *, per_second: float | None = None) -> Recording:
     return Recording(
         path,
         "video",
-        frames=lambda: _decoded(path, interval_us, trouble),
+        frames=lambda: _decoded(path, interval_us, trouble.anew("frames")),
         trouble=trouble,
         notes={"encoding": "srgb", "frame_size": f"{first.image.shape[1]}x{first.image.shape[0]}"},
     )
