@@ -34,6 +34,10 @@ def m3ed(file: h5py.File) -> None:
         shifted = EVENTS.t_us + (0 if camera == "left" else 5)
         group["x"], group["y"], group["t"], group["p"] = EVENTS.x, EVENTS.y, shifted, EVENTS.p
         group["calib/resolution"] = np.array(SIZE)
+    images = np.arange(3 * 8 * 6, dtype=np.uint8).reshape(3, 6, 8, 1)
+    file["ovc/left/data"], file["ovc/right/data"] = images, images + 1
+    file["ovc/rgb/data"] = np.concatenate([images, images + 1, images + 2], -1)
+    file["ovc/ts"] = np.arange(0, 120_000, 40_000)
 
 
 def event_utils(file: h5py.File) -> None:
@@ -106,6 +110,24 @@ def test_frames_of_a_file_that_has_them(tmp_path):
     assert open_hdf5(tmp_path / "e.h5", size=SIZE).frames is None
 
 
+def test_frames_of_m3ed_are_those_of_the_same_side_unless_told(tmp_path):
+    path = tmp_path / "e.h5"
+    with h5py.File(path, "w") as file:
+        m3ed(file)
+    frames = list(open_hdf5(path, topic="right").frames())
+    assert [frame.open_us for frame in frames] == [0, 40_000, 80_000]
+    np.testing.assert_array_equal(frames[1].image, 49 + np.arange(48).reshape(6, 8))
+    (red, green, blue) = next(open_hdf5(path, topic="left", image_topic="rgb").frames()).image[0, 0]
+    assert (red, green, blue) == (2, 1, 0)
+    assert open_hdf5(path, topic="left", image_topic="").frames is None
+    with pytest.raises(CaptureError, match="no frames of that camera") as caught:
+        open_hdf5(path, topic="left", image_topic="middle")
+    assert "left, rgb, right" in str(caught.value)
+    with h5py.File(path, "a") as file:
+        del file["ovc"]
+    assert open_hdf5(path, topic="left").frames is None
+
+
 # Questions and damage
 
 
@@ -127,6 +149,14 @@ def test_what_is_no_file_of_events(tmp_path):
     (tmp_path / "e.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(CaptureError, match="cannot open the event file"):
         open_hdf5(tmp_path / "e.h5", size=SIZE)
+
+
+def test_the_size_of_another_sensor_is_refused(tmp_path):
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        dsec(file)
+    with pytest.raises(CaptureError, match="most events lie outside the sensor") as caught:
+        open_hdf5(tmp_path / "e.h5", size=(3, 3)).load()
+    assert "check the size" in str(caught.value)
 
 
 def test_a_part_that_cannot_be_unpacked_ends_the_events(tmp_path, monkeypatch):
@@ -158,6 +188,7 @@ def _bytes(write: Callable) -> Callable[[], bytes]:
 
 
 fuzz.register("hdf5-dsec", fuzz.Case(_bytes(dsec), lambda p: open_hdf5(p, size=SIZE), ".h5"))
+fuzz.register("hdf5-m3ed", fuzz.Case(_bytes(m3ed), lambda p: open_hdf5(p, topic="left"), ".h5"))
 fuzz.register("hdf5-mvsec", fuzz.Case(_bytes(mvsec), lambda p: open_hdf5(p, topic="left"), ".h5"))
 
 

@@ -2,13 +2,15 @@
 
     DSEC, TUM-VIE, ours      events/{x, y, t, p}, and what `storage.event_layouts` tells; us
     EDS, Ev-DeblurNeRF       {x, y, t, p} at the root; the unit is not told
-    M3ED                     prophesee/{left, right}/{x, y, t, p}; us
+    M3ED                     prophesee/{left, right}/{x, y, t, p}; us; ovc/{left, right, rgb}/data,
+                             taken by cameras beside those of events, and ovc/ts in us
     E2VID, event_utils       events/{xs, ys, ts, ps}; s; images/image%09d with a time each
     MVSEC                    davis/{left, right}/events, rows x, y, t, p; s; image_raw, image_raw_ts
     v2e                      events, rows t, x, y, p; us
 
-Where a file holds several cameras, the caller names one. Frames of these files have one time each;
-how long the shutter was open they do not tell.
+Where a file holds several cameras, the caller names one; frames are those of the same side unless
+another camera is named for them. Frames of these files have one time each; how long the shutter was
+open they do not tell.
 
 Source: Gehrig et al., *DSEC* (RA-L 2021); Klenk et al., *TUM-VIE* (IROS 2021); Chaney et al.,
 *M3ED* (CVPRW 2023); Stoffregen et al., *Reducing the Sim-to-Real Gap for Event Cameras* (ECCV
@@ -52,8 +54,8 @@ class Dialect:
     size: Callable[[h5py.File, str], tuple[int, int] | None] = lambda file, camera: None
     """How the file tells the size of its sensor."""
     frames: Callable[[h5py.File, str], Iterator[Frame]] | None = None
-    first_frame: str = ""
-    """Path that is there if frames are."""
+    images: str = ""
+    """Path of the frames, if the file has any."""
 
     @property
     def table(self) -> bool:
@@ -101,6 +103,7 @@ def open_hdf5(
     unit: str | None = None,
     size: tuple[int, int] | None = None,
     topic: str | None = None,
+    image_topic: str | None = None,
 ) -> Recording:
     """Open an HDF5 file of events.
 
@@ -109,38 +112,48 @@ def open_hdf5(
         unit: Of its times (ns, us, ms, s), where it does not say.
         size: Width and height of the sensor, where it does not say.
         topic: Which of several cameras, e.g. "left".
+        image_topic: Which camera's frames, if not those of the same side; "" for none.
 
     Raises:
         CaptureError: It holds no events in a known layout, or does not say its unit or size.
     """
     with _whole(path):
-        return _recording(path, unit, size, topic)
+        with _opened(path) as file:
+            found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
+        if not found:
+            return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
+        dialect, camera = _chosen(found, topic, path)
+        made = recording_of(
+            dialect.layout, path, lambda: _event_file(path, dialect, camera, unit, size)
+        )
+        return replace(made, frames=_frames(path, dialect, camera, image_topic))
 
 
-def _recording(
-    path: Path, unit: str | None, size: tuple[int, int] | None, topic: str | None
-) -> Recording:
+def _frames(
+    path: Path, dialect: Dialect, camera: str, asked: str | None
+) -> Callable[[], Iterator[Frame]] | None:
+    """What reads the frames; None if there are none."""
+    read, name = dialect.frames, camera if asked is None else asked
+    if read is None or asked == "":
+        return None
     with _opened(path) as file:
-        found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
-    if not found:
-        return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
-    dialect, camera = _chosen(found, topic, path)
-
-    def open_file() -> EventFile:
-        return _event_file(path, dialect, camera, unit, size)
-
-    made = recording_of(dialect.layout, path, open_file)
-    with _opened(path) as file:
-        has_frames = dialect.first_frame.replace(CAMERA, camera) in file
-    if dialect.frames is None or not dialect.first_frame or not has_frames:
-        return made
-    read = dialect.frames
+        before, star, after = dialect.images.partition(CAMERA)
+        group: Any = file.get(before.rstrip("/") or "/") if star else None
+        able = [one for one in group or () if f"{before}{one}{after}" in file]
+        there = name in able if star else dialect.images in file and not asked
+    if asked and not there:
+        raise CaptureError(
+            "the file has no frames of that camera",
+            where=path,
+            got=asked,
+            do=f"choose an image topic: {', '.join(able) or 'there is no choice here'}",
+        )
 
     def frames() -> Iterator[Frame]:
         with _whole(path), _opened(path) as file:
-            yield from read(file, camera)
+            yield from read(file, name)
 
-    return replace(made, frames=frames)
+    return frames if there else None
 
 
 def _chosen(found: list[tuple[Dialect, str]], topic: str | None, path: Path) -> tuple[Dialect, str]:
@@ -255,11 +268,33 @@ def _mvsec_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
 
 
 def _mvsec_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
-    sensor: Any = file[f"davis/{camera}"]
-    images, times = sensor["image_raw"], sensor["image_raw_ts"]
+    images, times = (_filled(file, f"davis/{camera}/image_raw{end}") for end in ("", "_ts"))
     times_us = whole_us(times[:], "s", file.filename)
     for image, t_us in zip(images, times_us.tolist(), strict=False):
         yield Frame(image, t_us, t_us)
+
+
+def _m3ed_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
+    images, times = _filled(file, f"ovc/{camera}/data"), _filled(file, "ovc/ts")
+    if images.ndim != 4 or images.shape[3] not in (1, 3):
+        raise CaptureError(
+            "frames must be pictures of one or three channels",
+            where=f"{file.filename}, {images.name}",
+            got=images,
+        )
+    times_us = whole_us(times[:], "us", file.filename)
+    for image, t_us in zip(images, times_us.tolist(), strict=False):
+        # Colours are stored as BGR.
+        yield Frame(image[..., 0] if image.shape[2] == 1 else image[..., ::-1], t_us, t_us)
+
+
+def _filled(file: h5py.File, name: str) -> Any:
+    """A data set that is as long as it says."""
+    found = file[name]
+    if not isinstance(found, h5py.Dataset):
+        raise TypeError(f"{name} is no data set")
+    expect_filled(found, f"{file.filename}, {name}")
+    return found
 
 
 def _numbered_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
@@ -272,7 +307,15 @@ def _numbered_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
 
 
 DIALECTS = (
-    Dialect("M3ED", f"prophesee/{CAMERA}/", ("x", "y", "t", "p"), "us", _m3ed_size),
+    Dialect(
+        "M3ED",
+        f"prophesee/{CAMERA}/",
+        ("x", "y", "t", "p"),
+        "us",
+        _m3ed_size,
+        _m3ed_frames,
+        f"ovc/{CAMERA}/data",
+    ),
     Dialect(
         "event_utils HDF5",
         "events",
@@ -289,7 +332,7 @@ DIALECTS = (
         "s",
         _mvsec_size,
         _mvsec_frames,
-        f"davis/{CAMERA}/image_raw_ts",
+        f"davis/{CAMERA}/image_raw",
     ),
     Dialect("v2e HDF5", "events", ("txyp",), "us"),
 )

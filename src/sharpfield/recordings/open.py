@@ -61,7 +61,7 @@ class Told:
     topic: str | None = None
     """Which of several cameras, streams or topics of events."""
     image_topic: str | None = None
-    """Which of several topics of images."""
+    """Which of several topics, or cameras, of images."""
     columns: str | None = None
     """What the columns of a table are, in their order, like "xytp"."""
     encoding: str | None = None
@@ -276,9 +276,9 @@ FORMATS: dict[str, Format] = {
     "hdf5": Format(
         _begins(b"\x89HDF\r\n\x1a\n"),
         open_hdf5,
-        "events; frames of MVSEC and event_utils",
+        "events; frames of M3ED, MVSEC and event_utils",
         "HDF5",
-        takes=("size", "unit", "topic"),
+        takes=("size", "unit", "topic", "image_topic"),
     ),
     "npz": Format(
         lambda path, head: _zipped(path, head, ".npy"),
