@@ -44,6 +44,8 @@ class Case:
     """How many events a byte may stand for; 12 also covers EVT3, 6 at most."""
     seconds: float = 2.0
     """How long reading one file may take."""
+    mebibytes: float = 256.0
+    """How much more memory reading may take than reading the sound file took."""
 
 
 CASES: dict[str, Case] = {}
@@ -71,13 +73,16 @@ def check(open_function: Open, path: Path, *, case: Case | None = None) -> str:
         "refused" (by a CaptureError), "partial" (with `trouble` noted) or "whole".
 
     Raises:
-        AssertionError: Events are unsound, or more than the bytes can hold, or it took too long.
+        AssertionError: Events are unsound, or more than the bytes can hold, or it took too long or
+            too much memory.
     """
     per_byte, seconds = (case.most_per_byte, case.seconds) if case else (12.0, 2.0)
+    most_memory = _peak() + (case.mebibytes if case else 256.0)
     begin = time.process_time()  # others may be using the processor, too
     outcome = _read(open_function, path, most=int(per_byte * path.stat().st_size) + 1)
     took = time.process_time() - begin
     assert took < seconds, f"took {took:.1f} s"
+    assert _peak() < most_memory, f"took {_peak():.0f} MiB"
     return outcome
 
 
@@ -107,6 +112,11 @@ def campaign(name: str, *, files: int, folder: Path, seed: int = 0) -> Counter[s
         finally:
             faulthandler.cancel_dump_traceback_later()
     return outcomes
+
+
+def _peak() -> float:
+    """The most memory that this process has had so far, in MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _read(open_function: Open, path: Path, *, most: int) -> str:
@@ -206,9 +216,8 @@ def main() -> None:
         begin = time.perf_counter()
         outcomes = campaign(name, files=asked.files, folder=folder, seed=asked.seed)
         took = time.perf_counter() - begin
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         counts = ", ".join(f"{count} {outcome}" for outcome, count in sorted(outcomes.items()))
-        print(f"{name}: {counts}; {took:.0f} s, peak {peak} MiB; {folder}", flush=True)
+        print(f"{name}: {counts}; {took:.0f} s, peak {_peak():.0f} MiB; {folder}", flush=True)
 
 
 if __name__ == "__main__":

@@ -151,6 +151,16 @@ def test_what_is_no_file_of_events(tmp_path):
         open_hdf5(tmp_path / "e.h5", size=SIZE)
 
 
+def test_no_length_is_believed_that_a_damaged_superblock_tells(tmp_path):
+    path = tmp_path / "e.h5"
+    data = bytearray(_bytes(dsec)())
+    assert data[48:56] == b"\xff" * 8
+    data[48:56] = (0xFF).to_bytes(8, "little")
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match="a superblock that goes on elsewhere"):
+        open_hdf5(path, size=SIZE)
+
+
 def test_the_size_of_another_sensor_is_refused(tmp_path):
     with h5py.File(tmp_path / "e.h5", "w") as file:
         dsec(file)

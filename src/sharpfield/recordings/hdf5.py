@@ -31,7 +31,7 @@ from sharpfield.recordings.columns import recording_of
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.storage.event_columns import known_unit, whole_us
 from sharpfield.storage.event_file import UNREADABLE, EventFile
-from sharpfield.storage.event_layouts import compression_plugin, expect_filled, open_events
+from sharpfield.storage.event_layouts import expect_filled, open_events, opened_hdf5
 
 CAMERA = "*"
 """Stands in a path for the name of one of several cameras."""
@@ -118,7 +118,7 @@ def open_hdf5(
         CaptureError: It holds no events in a known layout, or does not say its unit or size.
     """
     with _whole(path):
-        with _opened(path) as file:
+        with opened_hdf5(path) as file:
             found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
         if not found:
             return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
@@ -136,7 +136,7 @@ def _frames(
     read, name = dialect.frames, camera if asked is None else asked
     if read is None or asked == "":
         return None
-    with _opened(path) as file:
+    with opened_hdf5(path) as file:
         before, star, after = dialect.images.partition(CAMERA)
         group: Any = file.get(before.rstrip("/") or "/") if star else None
         able = [one for one in group or () if f"{before}{one}{after}" in file]
@@ -150,7 +150,7 @@ def _frames(
         )
 
     def frames() -> Iterator[Frame]:
-        with _whole(path), _opened(path) as file:
+        with _whole(path), opened_hdf5(path) as file:
             yield from read(file, name)
 
     return frames if there else None
@@ -174,7 +174,7 @@ def _event_file(
     path: Path, dialect: Dialect, camera: str, unit: str | None, size: tuple[int, int] | None
 ) -> EventFile:
     with ExitStack() as resources:
-        file = resources.enter_context(_opened(path))
+        file = resources.enter_context(opened_hdf5(path))
         held: Any = file[dialect.at(camera)]
         if dialect.table:
             expect_filled(held, f"{path}, {held.name}")
@@ -227,19 +227,6 @@ def _whole(path: Path) -> Iterator[None]:
     except DAMAGED as error:
         raise CaptureError(
             "the file is damaged", where=path, got=error, do="copy or convert it again"
-        ) from None
-
-
-def _opened(path: Path) -> h5py.File:
-    compression_plugin()  # makes more compression filters known to HDF5
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise CaptureError(
-            "cannot open the event file: it is missing, truncated, or not HDF5",
-            where=path,
-            got=error,
-            do="copy or convert it again",
         ) from None
 
 

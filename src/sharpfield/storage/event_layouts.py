@@ -38,6 +38,9 @@ TICKS = {1: "ns", 1000: "us", 1_000_000: "ms"}
 THRESHOLDS = ("threshold_off", "threshold_on")
 """Attributes of a file, and notes of a capture, that give the contrast thresholds."""
 
+SUPERBLOCK = b"\x89HDF\r\n\x1a\n"
+"""What HDF5 files begin with."""
+
 BLOSC, PROPHESEE_ECF = 32001, 0x8ECF
 """Numbers of HDF5 compression filters that need a plugin."""
 
@@ -111,18 +114,43 @@ def _number(archive: zipfile.ZipFile, name: str) -> int:
     return int(stored) if stored.shape == () and stored.dtype.kind in "iu" else 0
 
 
-def _open_hdf5(path: Path) -> EventFile:
+def opened_hdf5(path: Path) -> h5py.File:
+    """An HDF5 file, whatever it is compressed with.
+
+    Raises:
+        CaptureError: It cannot be opened.
+    """
     compression_plugin()  # makes more compression filters known to HDF5
+    try:
+        if _continued(path):
+            raise OSError("a superblock that goes on elsewhere")
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise CaptureError(
+            "cannot open the event file: it is missing, truncated, or not HDF5",
+            where=path,
+            got=error,
+            do="copy or convert it again",
+        ) from None
+
+
+def _continued(path: Path) -> bool:
+    """Whether an older superblock names another block, as only that of a file in parts does.
+
+    Of damage that looks so, the library would believe any length, and make room for it.
+    """
+    with path.open("rb") as file:
+        start = file.read(64)
+    version, width = start[8:9], sum(start[13:14])
+    if not start.startswith(SUPERBLOCK) or version not in (b"\0", b"\1"):
+        return False
+    place = 24 + 4 * version[0] + 3 * width
+    return start[place : place + width] != b"\xff" * width
+
+
+def _open_hdf5(path: Path) -> EventFile:
     with ExitStack() as resources:
-        try:
-            file = resources.enter_context(h5py.File(path, "r"))
-        except OSError as error:
-            raise CaptureError(
-                "cannot open the event file: it is truncated, or not HDF5",
-                where=path,
-                got=f"{path.stat().st_size} bytes; {error}",
-                do="copy or convert it again",
-            ) from None
+        file = resources.enter_context(opened_hdf5(path))
         group = file.get("events")
         grouped = isinstance(group, h5py.Group)
         holder = group if grouped else file
