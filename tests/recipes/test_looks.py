@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures import event_index
 from sharpfield.core import Capture, CaptureError, EventPairs, Instants, Pixels
 from sharpfield.core.measurements import Batch
-from sharpfield.formation.event_phase import LONGEST_US
+from sharpfield.formation.event_phase import LONGEST_US, phase_at
 from sharpfield.formation.sharp_instants import Belief
 from sharpfield.recipes.looks import LookOptions, Looks
 from sharpfield.simulation import EventSensor, Rig, Timing, simulate
@@ -127,6 +128,7 @@ def phase(capture: Capture, x: int, y: int, t_us: int) -> float | None:
 def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
     capture, known = busy(), 0
     made, whole = looks(capture), capture.needed_events
+    index = event_index(whole)
     for batch in (made.exposure(3, events=True, belief=BELIEF), made.stretch(5)):
         look, events = of(batch)
         assert events is not None and events.shape == (1, look.shape[1] - 1, 12, 16, 1)
@@ -138,7 +140,14 @@ def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
                 p = whole.p[here & (whole.t_us > start) & (whole.t_us <= end)]
                 ends = [phase(capture, x, y, int(t)) for t in (start, end)]
                 known += sum(part is not None for part in ends)
-                parts = [part or 0.0 for part in ends]
+                likely = [
+                    float(phase_at(index, int(t), width=16, height=12)[0][y, x])
+                    for t in (start, end)
+                ]
+                parts = [
+                    guess if part is None else part
+                    for part, guess in zip(ends, likely, strict=True)
+                ]
                 brighter = (p > 0).sum() + max(parts[1], 0) - max(parts[0], 0)
                 darker = -(p < 0).sum() + min(parts[1], 0) - min(parts[0], 0)
                 assert pixel.positive.item() == pytest.approx(brighter, abs=1e-3)

@@ -3,9 +3,11 @@
 An event says that a whole threshold is behind; at any other time the log light of a pixel is
 somewhere between its last event and its next one. Where both have the same sign, the light has
 been moving one way, and the share of the time between them tells the share of the threshold: the
-*phase*. Where they differ, or one of them is missing, the light turned around at a place nobody
-knows, and the phase is unknown. Counts of events alone are off by up to one at each end, and always
-too few after a turn; with the phase they are not.
+*phase*. Where they differ the light turned around at a height nobody knows, less than a threshold
+beyond the last event. If every height is as likely and the light turns as a thrown stone does, it
+spent the time a third of a threshold beyond, on average, and only at last fell to the next event.
+Left out, this *overshoot* is what makes counts of events too few after a turn, and thresholds
+that explain them too large.
 """
 
 from typing import no_type_check
@@ -21,6 +23,13 @@ from sharpfield.ops.event_index import EventIndex
 LONGEST_US = 20_000
 """Between two events farther apart than this the light may have stood still for a while."""
 
+OVERSHOOT = 1 / 3
+"""Mean height beyond the last event until the light turns back: half of a threshold at the top,
+two thirds of that over the time. Half as much before another event of the same sign."""
+
+FALL_US, FALL_SHARE = 4_000, 0.4
+"""The light falls to its next event within this time, or this share of the time between the two."""
+
 
 def phase_at(
     index: EventIndex, time_us: int, *, width: int, height: int
@@ -34,19 +43,19 @@ def phase_at(
         height: Of the sensor.
 
     Returns:
-        -1...1, zero where it is unknown; and whether it is known.
+        -1...1, what is likely where it is not known; and whether it is known.
     """
     assert index.sites == width * height, "sites are the pixels of the sensor"
     phase = np.zeros(index.sites, np.float32)
     known = np.zeros(index.sites, np.bool_)
-    _phases(index.offset, index.t_us, index.p, time_us, LONGEST_US, phase, known)
+    _phases(index.offset, index.t_us, index.p, time_us, phase, known)
     shape = height, width
     return torch.as_tensor(phase.reshape(shape)), torch.as_tensor(known.reshape(shape))
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _phases(offset, t_us, p, time_us, longest_us, phase, known):
+def _phases(offset, t_us, p, time_us, phase, known):
     for site in range(len(phase)):
         first, low, high = offset[site], offset[site], offset[site + 1]
         while low < high:
@@ -55,11 +64,17 @@ def _phases(offset, t_us, p, time_us, longest_us, phase, known):
                 low = middle + 1
             else:
                 high = middle
-        if low == first or low == offset[site + 1] or p[low] != p[low - 1]:
+        if low == first:
             continue
-        gap = t_us[low] - t_us[low - 1]
-        if gap > longest_us:
+        if low == offset[site + 1]:
+            phase[site] = OVERSHOOT * p[low - 1]
             continue
-        known[site] = True
-        if gap > 0:
-            phase[site] = p[low] * (time_us - t_us[low - 1]) / gap
+        gap, since, same = t_us[low] - t_us[low - 1], time_us - t_us[low - 1], p[low] == p[low - 1]
+        if same and gap <= LONGEST_US:
+            known[site] = True
+            phase[site] = p[low] * since / max(gap, 1)
+            continue
+        beyond = OVERSHOOT * p[low - 1] * (0.5 if same else 1.0)
+        fall = min(FALL_US, FALL_SHARE * gap)
+        fallen = min(max(1 - (gap - since) / fall, 0.0), 1.0) if fall > 0 else 0.0
+        phase[site] = (1 - fallen) * beyond + fallen * p[low]

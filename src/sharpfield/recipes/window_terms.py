@@ -15,6 +15,9 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.formation.response import Response
 from sharpfield.formation.threshold import Thresholds
 
+BLOCK = 8
+"""Side of a block of pixels, far larger than what is soft or misplaced."""
+
 TINY = 1e-12
 """Mean square change of log light of a scene that does not move."""
 
@@ -55,20 +58,31 @@ def threshold_error(
     """Mean square of the number of events from the first instant of a look to its last.
 
     What thresholds are learned from; the scene learns nothing. They do not go down the slope of
-    this error, which would make them too small: a scene that is still a little soft changes less
-    than the light did. What it leaves out has little to do with what it shows, though, so that
-    both thresholds are right when the rest of the events does not change with the scene. Each is
-    asked to grow by the part that is missing where the scene changed in its direction. (The change
-    of the scene is an instrument for the counts, in the words of regression with errors in both.)
-    Over a long time, events that were rounded away and light that came back matter least.
+    this error, which would make them too small: a scene that is a little soft changes less than
+    the light did, and one that is a little misplaced changes where it did not. Over blocks of
+    pixels neither matters, so that the mean change of a block is compared with what of it the
+    events of its pixels leave out, and each threshold is asked to grow by the part that is missing
+    where the scene changed in its direction. (In the words of regression with errors on both
+    sides, that mean is an instrument for the counts.) Over a long time, events that were rounded
+    away and light that came back matter least.
     """
     whole = replace(
         events[:, 0], negative=events.negative.sum(1), positive=events.positive.sum(1), slack=None
     ).reshape(-1)
     negative, positive = thresholds(whole)
-    total = change.detach().sum(1).reshape(-1)
-    missing = total - whole.measured(negative.detach(), positive.detach())
-    asked = total * missing / total.square().mean().clamp_min(TINY)
-    pull = -(asked * torch.where(total > 0, positive, negative).log()).mean()
+    total = change.detach().sum(1)
+    shown = _of_blocks(total).reshape(-1)
+    missing = total.reshape(-1) - whole.measured(negative.detach(), positive.detach())
+    asked = shown * missing / shown.square().mean().clamp_min(TINY)
+    pull = -(asked * torch.where(shown > 0, positive, negative).log()).mean()
     error = (missing / (negative * positive).detach().sqrt()).square().mean()
     return error + pull - pull.detach()
+
+
+def _of_blocks(image: Float[Tensor, "m h w c"]) -> Float[Tensor, "m h w c"]:
+    """Means over blocks of pixels, at each of their pixels."""
+    height, width = image.shape[1:3]
+    each = image.movedim(-1, 1)
+    means = torch.nn.functional.avg_pool2d(each, BLOCK, ceil_mode=True, count_include_pad=False)
+    wide = means.repeat_interleave(BLOCK, -1).repeat_interleave(BLOCK, -2)
+    return wide[..., :height, :width].movedim(1, -1)
