@@ -4,8 +4,8 @@
 
 Without a capture (`--capture FOLDER`) the room is simulated: 120 frames of 240x180, 75 % blurred.
 `weights` compares frames weighted by quality with frames that all count alike; `capacity` gives the
-networks more points and wider descriptors; `points` takes fewer and noisier ones. With `--steps 800`
-instead of minutes it comes out the same on a busy machine.
+networks more points and wider descriptors; `points` takes fewer and noisier ones. With
+`--steps 800` instead of minutes it comes out the same on a busy machine.
 """
 
 import argparse
