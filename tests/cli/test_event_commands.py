@@ -111,6 +111,57 @@ def test_comparing_says_how_the_twin_agrees(
     assert (tmp_path / "twin-compare.png").is_file()
 
 
+def test_another_recording_can_be_compared_with(splats: Path, tmp_path: Path) -> None:
+    """A twin's own file, in every format that the program reads, agrees with the twin."""
+    words = ("--from", 20, "--to", 80, "--on", 0, *FAST)
+    for ending in ("h5", "npz", "raw"):
+        first = tmp_path / f"first.{ending}"
+        assert run("events", splats, "--out", first, *words) == 0
+        out = tmp_path / f"second-{ending}.csv"
+        assert run("events", splats, "--out", out, "--against", first, *words) == 0
+        found = json.loads((tmp_path / f"second-{ending}-compare.json").read_text())
+        assert found["predicted"] == found["recorded"] > 100 and found["timing_ms"] == 0
+        assert (found["threshold_on"], found["matched"]) == (0.02, False)
+
+
+def test_a_camera_that_was_on_before_goes_on(splats: Path, tmp_path: Path) -> None:
+    """Events from 40 ms on are those of the whole, if the camera was switched on as early."""
+    whole, late, cold = (tmp_path / f"{name}.csv" for name in ("whole", "late", "cold"))
+    assert run("events", splats, "--out", whole, *FAST) == 0
+    assert run("events", splats, "--out", late, "--on", 0, "--from", 40, *FAST) == 0
+    assert run("events", splats, "--out", cold, "--from", 40, *FAST) == 0
+    rows = [np.loadtxt(one, np.int64, delimiter=",", skiprows=1) for one in (whole, late, cold)]
+    after = rows[0][rows[0][:, 0] >= 40_000]
+    np.testing.assert_array_equal(rows[1], after)
+    assert len(rows[2]) != len(after) or (rows[2] != after).any()
+
+
+def test_thresholds_are_matched_and_said(
+    splats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "twin.h5"
+    words = ("--from", 30, "--to", 45, "--compare", "--match", *FAST)
+    assert run("events", splats, "--out", out, *words) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    found = json.loads((tmp_path / "twin-compare.json").read_text())
+    assert "recorded events outside the time rendered; without, the scene makes" in said
+    assert found["matched"] and found["threshold_on"] != 0.02
+    assert f"Thresholds x {found['threshold_on'] / 0.02:.3f} to brighter" in said
+
+
+def test_an_interrupted_command_leaves_nothing(
+    splats: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sharpfield.cli.event_output.count_events", stopped)
+    for ending in ("h5", "npz", "raw", "csv"):
+        out = tmp_path / f"twin.{ending}"
+        assert run("events", splats, "--out", out, "--frames", 20, "--to", 40, *FAST) == 130
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -125,6 +176,11 @@ def test_comparing_says_how_the_twin_agrees(
         (("--out", "x.h5", "--threshold", -1), "thresholds must be positive"),
         (("--out", "x.h5", "--step-ms", 0), "steps of time"),
         (("--out", "x.h5", "--frames", 0), "windows must have a length"),
+        (("--out", "x.h5", "--to", 5000), "use times from 0 to"),
+        (("--out", "x.h5", "--from", 20, "--on", 30), "not after its first event"),
+        (("--out", "x.h5", "--subpixels", 0), "at least one part"),
+        (("--out", "x.h5", "--compare", "--against", "y.h5"), "not with both"),
+        (("--out", "x.h5", "--against", "gone.raw"), "gone.raw"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

@@ -26,6 +26,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
 from sharpfield.evaluation.device import device_of
+from sharpfield.evaluation.event_films import event_films
 from sharpfield.evaluation.event_scores import event_scores
 from sharpfield.evaluation.more_scores import aligned_psnr, depth_error, distances
 from sharpfield.evaluation.pictures import colour_depth, eight_bit
@@ -125,7 +126,7 @@ def evaluate(
         "train": _training(run),
     }
     if (events := event_scores(model, capture)) is not None:
-        metrics["events"] = events
+        metrics["events"] = {**events, "films": event_films(model, capture, run)}
     metrics["mean"] |= _more(model, capture, test_views, brightness, events)
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}

@@ -81,10 +81,10 @@ def event_scores(
     pairs: dict[float, list[tuple[Tensor, Tensor]]] = {length: [] for length in lengths}
     for track in np.unique(np.asarray(capture.test_events.track)).tolist():
         for start in (np.arange(windows) + 0.5) / windows * (1 - max(lengths)):
-            first = _log_view(model, int(track), float(start))
+            first = log_view(model, int(track), float(start))
             for length in lengths:
-                change = _log_view(model, int(track), float(start + length)) - first
-                counted = _recorded(capture, index, int(track), (start, start + length))
+                change = log_view(model, int(track), float(start + length)) - first
+                counted = recorded_counts(capture, index, int(track), (start, start + length))
                 pairs[length].append((change, counted))
     return {
         "definitions": DEFINITIONS,
@@ -92,7 +92,7 @@ def event_scores(
     }
 
 
-def _log_view(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
+def log_view(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
     """Log intensity that a camera sees at a time."""
     own = model.capture
     home = device_of(own.trajectory)
@@ -104,7 +104,7 @@ def _log_view(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
     return (luma(seen) + FLOOR).log()
 
 
-def _recorded(
+def recorded_counts(
     capture: Capture, index: EventIndex, track: int, window: tuple[float, float]
 ) -> Float[Tensor, "2 h w"]:
     """How many events to darker and to brighter each pixel reported."""
@@ -116,10 +116,15 @@ def _recorded(
     return torch.from_numpy(counts).permute(2, 0, 1).float()
 
 
+def usual_threshold(capture: Capture) -> float:
+    """Mean of the thresholds to darker and to brighter."""
+    return sum(_thresholds(capture)) / 2
+
+
 def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
     """Means over event frames."""
-    off, on = (float(capture.notes.get(f"threshold_{sign}", USUAL)) for sign in ("off", "on"))
-    usual = (off + on) / 2
+    off, on = _thresholds(capture)
+    usual = usual_threshold(capture)
     recorded = [on * counts[1] - off * counts[0] for _, counts in pairs]
     most = max(float(torch.stack(recorded).abs().max()), usual)
     rows: list[Scores] = []
@@ -140,6 +145,12 @@ def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
             }
         )
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+
+
+def _thresholds(capture: Capture) -> tuple[float, float]:
+    """To darker and to brighter, as noted."""
+    off, on = (float(capture.notes.get(f"threshold_{sign}", USUAL)) for sign in ("off", "on"))
+    return off, on
 
 
 def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:

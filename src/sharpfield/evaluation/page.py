@@ -75,6 +75,16 @@ def drawing(svg: str | None, caption: str) -> str:
     return f'<figure class="drawing">{svg}<figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
+def film(data: bytes, caption: str) -> str:
+    """An mp4 film with its caption, played over and over without sound."""
+    told = html.escape(caption)
+    address = "data:video/mp4;base64," + base64.b64encode(data).decode()
+    return (
+        f'<figure><video src="{address}" aria-label="{told}" controls autoplay loop muted'
+        f" playsinline></video><figcaption>{told}</figcaption></figure>"
+    )
+
+
 def comparison(views: Sequence[View], look: Look, *, left: str, right: str, first: str = "") -> str:
     """Views in rows of pictures; with JavaScript, a slider above them compares any two.
 

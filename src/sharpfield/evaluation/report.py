@@ -16,6 +16,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.evaluation import page
 from sharpfield.evaluation.captured import captured
 from sharpfield.evaluation.compared import RESULT, STORED, compared_views, input_name
+from sharpfield.evaluation.event_films import events_section
 from sharpfield.evaluation.figures import curves_figure
 from sharpfield.evaluation.page import Look, View, section
 from sharpfield.evaluation.pictures import ERROR_WHITE
@@ -69,6 +70,7 @@ def _body(run: Path, capture: Capture, metrics: Mapping[str, Any], story: Story,
     parts = [
         _header(metrics, story),
         _result(train, test, metrics, look, recorded=input_name(capture)),
+        events_section(run, metrics),
         captured(capture, look),
         _numbers(metrics),
         _training(run, metrics),

@@ -1,0 +1,127 @@
+"""Films of event frames: what a held-out event camera recorded, and what a model predicts for it.
+
+A film shows windows one after the other, recorded on the left, predicted on the right, in one
+scale. The prediction is the published one, the change of log light between the ends of a window in
+whole thresholds; the `events` command renders streams.
+
+Source: EvDNeRF (WACV 2024), figures and videos of event frames.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from sharpfield.captures import event_index
+from sharpfield.core.capture import Capture
+from sharpfield.core.protocols import Model
+from sharpfield.evaluation import page
+from sharpfield.evaluation.event_frames import busy
+from sharpfield.evaluation.event_scores import log_view, recorded_counts, usual_threshold
+from sharpfield.evaluation.pictures import colour_signs
+from sharpfield.evaluation.tables import Table, as_html
+from sharpfield.evaluation.video import write_film
+
+CAMERAS = 2
+"""Most cameras that are filmed, evenly spread over those held out."""
+WINDOWS = 20
+"""Of a film; together they last as long as the capture."""
+RATE = 8.0
+"""Windows per second."""
+HIGH_PX = 240
+"""Smaller pictures are enlarged by a whole number of times up to this height."""
+GAP_PX = 4
+"""Between the two."""
+
+COLUMNS = {
+    "event_psnr": "event PSNR (dB)",
+    "none_psnr": "of no events",
+    "event_ssim": "event SSIM",
+    "event_mae": "event MAE",
+    "count_psnr": "PSNR of counts (dB)",
+    "none_count_psnr": "of no events",
+    "event_f1": "F1 of busy pixels",
+}
+
+Colours = UInt8[np.ndarray, "height width 3"]
+
+
+def event_films(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
+    """Write a film for some held-out event cameras.
+
+    Args:
+        model: Trained.
+        capture: On the same clock as the model's own; holds event cameras out.
+        run: Folder that gets `renders/events/`.
+
+    Returns:
+        The number of each camera, and where its film is.
+    """
+    held_out = capture.test_events
+    if held_out is None or not len(held_out):
+        return []
+    tracks = np.unique(np.asarray(held_out.track)) if held_out.track is not None else np.zeros(1)
+    chosen = tracks[np.linspace(0, len(tracks) - 1, min(CAMERAS, len(tracks))).astype(int)]
+    found = []
+    for track in chosen.astype(int).tolist():
+        path = Path("renders") / "events" / f"{track:02d}.mp4"
+        (run / path).parent.mkdir(parents=True, exist_ok=True)
+        write_film(run / path, _pictures(model, capture, track), rate=RATE)
+        found.append({"track": track, "film": path.as_posix()})
+    return found
+
+
+def events_section(run: Path, metrics: Mapping[str, Any]) -> str:
+    """The part of the page about held-out event cameras; nothing if there are none."""
+    events = metrics.get("events")
+    if events is None:
+        return ""
+    rows = tuple(
+        (f"1/{1 / float(length):.0f} of the capture", *(f"{scores[n]:.4g}" for n in COLUMNS))
+        for length, scores in events["lengths"].items()
+    )
+    films = [
+        page.film((run / one["film"]).read_bytes(), f"Camera {one['track']}")
+        for one in events.get("films", [])
+        if (run / one["film"]).is_file()
+    ]
+    return page.section(
+        "Held-out event cameras",
+        "".join(films),
+        as_html(Table(("windows", *COLUMNS.values()), rows)),
+        page.folded("What the numbers are", page.definitions(events["definitions"])),
+        intro="Event frames, recorded on the left and predicted on the right: red brighter, blue"
+        " darker, in one scale.",
+    )
+
+
+def _pictures(model: Model, capture: Capture, track: int) -> list[Colours]:
+    """Both frames of each window."""
+    assert capture.test_events is not None
+    index = event_index(capture.test_events)
+    ends = np.linspace(0, 1, WINDOWS + 1)
+    views = [log_view(model, track, float(time)) for time in ends]
+    predicted = [
+        ((after - before) / usual_threshold(capture)).trunc().numpy()
+        for before, after in zip(views, views[1:], strict=False)
+    ]
+    counts = [
+        recorded_counts(capture, index, track, (float(a), float(b))).numpy()
+        for a, b in zip(ends, ends[1:], strict=False)
+    ]
+    recorded = [brighter - darker for darker, brighter in counts]
+    full = busy(np.stack(recorded).astype(np.int32))
+    return [
+        _beside(*(colour_signs(frame, full) for frame in pair))
+        for pair in zip(recorded, predicted, strict=True)
+    ]
+
+
+def _beside(left: Colours, right: Colours) -> UInt8[np.ndarray, "high wide 3"]:
+    """Both, enlarged."""
+    times = max(HIGH_PX // left.shape[0], 1)
+    left, right = (np.kron(one, np.ones((times, times, 1), np.uint8)) for one in (left, right))
+    gap = np.full((left.shape[0], GAP_PX, 3), 128, np.uint8)
+    return np.concatenate([left, gap, right], 1)

@@ -1,0 +1,59 @@
+"""Films of held-out event cameras, and their part of the report."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import numpy as np
+
+from sharpfield.evaluation import Story, evaluate, write_report
+from sharpfield.evaluation.event_films import GAP_PX, WINDOWS, event_films, events_section
+from tests.evaluation.test_event_scores import Scene
+from tests.evaluation.test_report import checked
+from tests.recipes.moving import tiny_moving
+
+
+def frames_of(path: Path) -> np.ndarray:
+    with av.open(path) as file:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
+
+
+def test_a_film_shows_what_was_recorded_beside_what_is_predicted(tmp_path: Path):
+    moving = tiny_moving()
+    (told,) = event_films(Scene(moving, 1.0), moving, tmp_path)
+    film = frames_of(tmp_path / told["film"])
+    assert film.shape == (WINDOWS, 240, 2 * 240 + GAP_PX, 3)
+    recorded, predicted = (part.astype(int) for part in (film[:, :, :240], film[:, :, -240:]))
+    assert brighter(recorded).any() and brighter(-recorded).any()
+    # of the true scene: what is predicted happened; remainders at both ends are left out
+    assert brighter(recorded)[brighter(predicted)].mean() > 0.7
+    assert not brighter(-recorded)[brighter(predicted)].mean() > 0.05
+    assert not brighter(frames_of_nothing(tmp_path)).any()
+
+
+def brighter(part: np.ndarray) -> np.ndarray:
+    """Where it is red; of what is negated, where it is blue."""
+    return part[..., 0] - part[..., 2] > 80
+
+
+def frames_of_nothing(folder: Path) -> np.ndarray:
+    moving = tiny_moving()
+    (told,) = event_films(Scene(moving, 0.0), moving, folder / "nothing")
+    return frames_of(folder / "nothing" / told["film"])[:, :, -240:].astype(int)
+
+
+def test_the_report_plays_it(tmp_path: Path):
+    moving = tiny_moving()
+    metrics = evaluate(Scene(moving, 1.0), moving, tmp_path)
+    assert [one["film"] for one in metrics["events"]["films"]] == ["renders/events/03.mp4"]
+    told = checked(write_report(tmp_path, moving, metrics, Story("a moving scene")))
+    assert sum(one.startswith("data:video/mp4;base64,") for one in told.references) == 1
+    for text in ("Held-out event cameras", "Camera 3", "event PSNR (dB)", "1/32 of the capture"):
+        assert text in told.text, text
+
+
+def test_without_held_out_events_there_is_no_film(tmp_path: Path):
+    still = replace(tiny_moving(), test_events=None)
+    assert event_films(Scene(still, 1.0), still, tmp_path) == []
+    assert events_section(tmp_path, {"mean": {}}) == ""
+    assert not list(tmp_path.iterdir())
