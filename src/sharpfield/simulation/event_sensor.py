@@ -96,12 +96,12 @@ DVS346 = EventSensor(
     cutoff_hz=400.0,
     start="random",
 )
-"""A DAVIS346 in moderate light: pixels of a Color-DAVIS346 or DAVIS346B are 346x260 (libcaer).
+"""A DAVIS346 in moderate light, 346x260 (libcaer, `davis.h`).
 
-v2e's command line (SensorsINI/v2e, `v2e_args.py`) has, for good light, a threshold of 0.2 in natural
-log with a spread of 0.03, 300 Hz in full light, a leak of 0.01 Hz, noise of 0.001 Hz, and a dead
-time of 500 us; its `noisy` pixels have 0.05, 30 Hz, 0.1 Hz, 5 Hz and 10 ms. Ours lie between the two
-in leak and noise, and beside the first in the rest. Assumed: the share of hot pixels.
+v2e's command line (SensorsINI/v2e, `v2e_args.py`) has, for good light, a threshold of 0.2 in
+natural log with a spread of 0.03, 300 Hz in full light, a leak of 0.01 Hz, noise of 0.001 Hz and a
+dead time of 500 us; its `noisy` pixels have 0.05, 30 Hz, 0.1 Hz, 5 Hz and 10 ms. Ours lie between
+the two in leak and noise, and beside the first in the rest. Assumed: the share of hot pixels.
 """
 
 GEN3_VGA = EventSensor(
