@@ -4,6 +4,7 @@ import torch
 
 from sharpfield.core.rays import Rays
 from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
+from sharpfield.ops._dispatch import using
 from sharpfield.ops.space_time_march import march_through_time
 from sharpfield.ops.voxel_march import march
 from sharpfield.rendering.march_through_time import ThroughBox, through_box
@@ -29,9 +30,10 @@ def test_moving_voxels_that_are_alike_at_all_moments_stand_still():
     place = torch.linspace(1.5, 5, 12).expand(6, -1).contiguous()
     still = march(seen.origin, seen.direction, place, [grid], opaque_end=False)
     zeros = torch.zeros(2, 2, 2, 4)
-    always = grid.expand(3, -1, -1, -1, -1).contiguous()
+    rows = torch.arange(grid[..., 0].numel(), dtype=torch.int32).view(grid.shape[:3])
+    always = rows.expand(3, -1, -1, -1)
     found = march_through_time(
-        seen.origin, seen.direction, 2 * seen.time - 1, place, [zeros], [always]
+        seen.origin, seen.direction, 2 * seen.time - 1, place, [zeros], [grid.view(-1, 4)], [always]
     )
     torch.testing.assert_close(found, still, atol=1e-5, rtol=0)
 
@@ -39,7 +41,8 @@ def test_moving_voxels_that_are_alike_at_all_moments_stand_still():
 def test_at_a_moment_only_its_own_cells_count():
     field = SpaceTimeVoxels(SIZE)
     with torch.no_grad():
-        field.moving[0][2] = filled(field.moving[0][2])
+        rows = field.rows[0][2].long()
+        field.moving[0][rows] = filled(field.moving[0][rows])
     view = ThroughBox(field, step=0.1)
     empty = ThroughBox(SpaceTimeVoxels(SIZE), step=0.1)
     for moment, changed in ((0.25, False), (0.5, True), (0.75, False), (0.6, True)):
@@ -62,6 +65,24 @@ def test_rays_of_one_measurement_are_shifted_alike():
     assert not torch.equal(light, again)
 
 
+def test_the_fast_march_is_the_plain_one():
+    """With gradients of the voxels alone, as in training; cells without values among them."""
+    where = [torch.rand(5, 6, 6, 6, generator=torch.Generator().manual_seed(5)) < 0.4]
+    where.append(torch.ones(2, 4, 4, 4).bool())
+    field, found = SpaceTimeVoxels(SIZE, where), {}
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.copy_(filled(parameter))
+    for choice in ("reference", "auto"):
+        field.zero_grad()
+        with using(choice):
+            seen = ThroughBox(field, step=0.1)(rays())
+        (seen.rgb.square().sum() + seen.depth.sum() + seen.opacity.sum()).backward()
+        found[choice] = [seen.rgb, seen.depth, *(p.grad for p in field.parameters())]
+    for plain, fast in zip(found["reference"], found["auto"], strict=True):
+        torch.testing.assert_close(fast, plain, atol=2e-4, rtol=1e-3)
+
+
 def test_where_rays_enter_and_leave():
     straight = Rays(
         torch.tensor([[0.0, 0, -3], [0, 0, 0.5], [0, 5, -3]]),
@@ -74,15 +95,18 @@ def test_where_rays_enter_and_leave():
     torch.testing.assert_close(leave, torch.tensor([4.0, 0.5, 0.0]))
 
 
-def test_frozen_cells_get_no_gradient():
-    field = SpaceTimeVoxels(SIZE)
-    where = torch.zeros(6, 6, 6, dtype=torch.bool)
-    where[:3] = True
-    field.freeze(0, where)
-    ThroughBox(field, step=0.1)(rays()).rgb.square().sum().backward()
-    gradient = field.moving[0].grad
-    assert gradient is not None
-    assert not gradient[:, :3].any() and gradient[:, 3:].any()
+def test_cells_without_values_stay_zero():
+    where = [torch.zeros(5, 6, 6, 6).bool(), torch.ones(2, 4, 4, 4).bool()]
+    where[0][2, 3:] = True
+    field = SpaceTimeVoxels(SIZE, where)
+    assert len(field.moving[0]) == 3 * 6 * 6
+    field.fill(torch.ones(5, 6, 6, 6).bool(), 7.0)
+    values, held = field.moments(0, 5)
+    assert torch.equal(held, where[0])
+    assert (values[..., 0][held] == 7).all() and not values[~held].any()
+    points = torch.tensor([[0.0, 0, 0.9], [0, 0, -0.9]])
+    torch.testing.assert_close(field.raw_density(points, 0.5), torch.tensor([7.0, 0.0]))
+    torch.testing.assert_close(field.raw_density(points, 0.625), torch.tensor([3.5, 0.0]))
 
 
 def test_it_may_start_nearly_empty():

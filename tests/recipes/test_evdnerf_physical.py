@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,7 +11,9 @@ from sharpfield.fields.space_time import SpaceTimeSize
 from sharpfield.geometry.centred import centred
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
 from sharpfield.recipes.moving import MovingOptions
-from sharpfield.recipes.swept import swept
+from sharpfield.recipes.swept import hull, silhouettes
+from sharpfield.simulation import MOVING_RIG, MOVING_TIMING, ring, simulate_moving
+from sharpfield.simulation.cameras import hand_held
 from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving
 
@@ -35,12 +38,12 @@ def learned(recipe: EvDNeRFPhysical, capture, steps: int = 20):
 
 
 @pytest.mark.parametrize("exposure_us", [0, 30_000])
-def test_twenty_steps_lower_every_term(exposure_us: int):
+def test_steps_lower_every_term(exposure_us: int):
     capture = tiny_moving(exposure_us)
-    start, batch = SMALL.build(capture, 0), None
-    batch = start.draw(30)
-    before = start.losses(batch, 30)
-    after = learned(SMALL, capture).losses(batch, 30)
+    start = SMALL.build(capture, 0)
+    batch = start.draw(90)
+    before = start.losses(batch, 90)
+    after = learned(SMALL, capture, 60).losses(batch, 90)
     for name in ("spans", "windows", "frames"):
         assert float(after[name]) < float(before[name]), name
     assert start.shutter.samples == (1 if exposure_us == 0 else SMALL.instants)
@@ -82,23 +85,69 @@ def test_changes_of_windows_add_up_and_flip():
     torch.testing.assert_close(change(seen.end, seen.start), -whole, atol=1e-6, rtol=0)
 
 
-def test_voxels_outside_the_hull_never_move():
+def test_voxels_move_only_within_the_hull():
     capture = tiny_moving().without(frames=True)
+    start = SMALL.build(capture, 0).scene.field
     model = learned(SMALL, capture, 8)
-    index = event_index(capture.needed_events)
-    grid = model.scene.field.moving[0].detach()
-    outside = ~swept(model.capture, index, grid.shape[1])
-    assert outside.any() and not outside.all()
-    assert not grid[:, outside].any()
-    assert grid[:, ~outside].any()
+    size = SMALL.scene.size
+    told = hull(
+        model.capture, event_index(capture.needed_events), cells=size.moving, moments=size.moments
+    )
+    assert told is not None and told.solid.any()
+    (values, held), (first, _) = (
+        one.moments(0, size.moments) for one in (model.scene.field, start)
+    )
+    assert torch.equal(held, told.possible) and held.any() and not held.all()
+    assert not values[~held].any() and values[held].any()
+    assert (first[..., 0][told.solid] == SMALL.scene.solid).all()
+    assert not first[..., 0][~told.solid].any()
 
 
-def test_the_hull_holds_what_moves():
-    """All moving parts of the scene stay within 1.2 of the middle of the table."""
-    capture, change = centred(tiny_moving())
-    hull = swept(capture, event_index(capture.needed_events), 9)
-    assert hull[4, 4, 4], "the hub is at the origin"
-    assert change.scale == pytest.approx(1 / 1.44, rel=0.01)
+@pytest.fixture(scope="module")
+def puppet():
+    """32x32 pixels, four cameras to learn from, one held out."""
+    timing = replace(MOVING_TIMING, frames=9, interval_us=125_000, step_us=12_500)
+    rig = replace(MOVING_RIG, size=(32, 32))
+    return centred(simulate_moving("puppet", ring(4, held_out=1), rig=rig, timing=timing))
+
+
+def test_the_hull_holds_what_moves(puppet):
+    """By the true depth of what a held-out camera sees."""
+    capture, _ = puppet
+    told = hull(capture, event_index(capture.needed_events), cells=24, moments=17)
+    assert told is not None and told.possible.float().mean() < 0.3
+    frames, camera, covered = capture.needed_frames, capture.camera, []
+    toward = camera.direction(camera.grid()).float()
+    for i in capture.split.test:
+        depth = torch.from_numpy(frames.depth[i])
+        local = toward / toward[..., 2:] * depth[..., None]
+        pose = capture.frame_pose(np.array([i]))[0].float()
+        place = (local[depth.isfinite()] @ pose[:, :3].T + pose[:, 3] + 1) / 2 * 23
+        x, y, z = place.round().long().clamp(0, 23).unbind(-1)
+        moment = round(16 * float(capture.clock.unit(frames.exposure.middle_us)[i]))
+        covered.append(told.possible[moment, z, y, x].float().mean())
+    assert float(torch.stack(covered).mean()) > 0.9
+
+
+def test_silhouettes_are_those_of_the_truth(puppet):
+    capture, _ = puppet
+    frames, seen = capture.needed_frames, silhouettes(capture, event_index(capture.events), 0, 33)
+    own = np.flatnonzero(frames.track == 0)
+    at = np.rint(32 * capture.clock.unit(frames.exposure.middle_us[own])).astype(int)
+    truth = torch.from_numpy(np.isfinite(frames.depth[own]))
+    same = (seen[at] & truth).sum((1, 2)) / (seen[at] | truth).sum((1, 2))
+    assert float(same.mean()) > 0.5
+
+
+def test_no_hull_without_cameras_that_stand_still():
+    timing = replace(MOVING_TIMING, frames=3)
+    carried = simulate_moving(
+        "glider", hand_held(), rig=replace(MOVING_RIG, size=(12, 12)), timing=timing
+    )
+    capture, _ = centred(carried)
+    assert hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
+    field = SMALL.build(carried, 0).scene.field
+    assert all((rows >= 0).all() for rows in field.rows)
 
 
 def test_thresholds_are_learned_only_if_asked():

@@ -1,8 +1,10 @@
 """Light along rays through voxels, some of which stand still while others change with time.
 
-A *moving grid* `[t, d, h, w, 4]` holds raw density and raw colour at moments evenly spread over the
-time from -1 to 1; between them it is linear. Moving and still grids (see `ops.voxel_march`) of
-any sizes add up. Points are in box coordinates, -1 to 1; outside there is nothing.
+A *moving grid* holds raw density and raw colour at moments evenly spread over the time from -1 to
+1; between them it is linear. Most of its cells are empty at most moments, so that only some have
+values: a table `[n, 4]` of these, and for each cell `[t, d, h, w]` its *row* there, or -1 where all
+is zero. Moving and still grids (see `ops.voxel_march`) of any sizes add up. Points are in box
+coordinates, -1 to 1; outside there is nothing.
 
 Source: DVGO (CVPR 2022) for voxels and activations, with time as a fourth axis.
 """
@@ -11,7 +13,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from sharpfield.ops._dispatch import Op
@@ -26,7 +28,8 @@ def march_through_time(
     time: Float[Tensor, "b"],
     place: Float[Tensor, "b s"],
     still: Sequence[Float[Tensor, "_ _ _ 4"]],
-    moving: Sequence[Float[Tensor, "_ _ _ _ 4"]],
+    moving: Sequence[Float[Tensor, "_ 4"]],
+    rows: Sequence[Int32[Tensor, "_ _ _ _"]],
 ) -> Float[Tensor, "b 5"]:
     """Red, green, blue, depth and opacity of rays.
 
@@ -36,18 +39,29 @@ def march_through_time(
         time: Of each ray, -1 to 1.
         place: Ray parameter of the samples, ascending; each stands for one step of length 1.
         still: Raw density and raw colour, by z, y and x.
-        moving: The same, by time, z, y and x; at least two moments.
+        moving: Values of moving cells, one table for each grid.
+        rows: Of moving cells, by time, z, y and x; at least two moments.
     """
     points = origin[:, None] + place[..., None] * direction[:, None]
     inside = (points.abs() <= 1).all(-1)
     found = [_trilinear(grid, points) for grid in still]
-    found += [_through_time(grid, points, time) for grid in moving]
+    found += [
+        _through_time(spread_out(values, at), points, time)
+        for values, at in zip(moving, rows, strict=True)
+    ]
     raw = torch.stack(found).sum(0)  # [b, s, 4]
     alpha = (1 - torch.exp(-F.softplus(raw[..., 0] + THIN))) * inside
     weights = weights_of_opacities(alpha)
     depth = (weights * place).sum(-1, keepdim=True)
     seen = gather(weights, torch.sigmoid(raw[..., 1:]))
     return torch.cat([seen, depth, weights.sum(-1, keepdim=True)], -1)
+
+
+def spread_out(
+    values: Float[Tensor, "n 4"], rows: Int32[Tensor, "*cells"]
+) -> Float[Tensor, "*cells 4"]:
+    """A grid with all its cells: zero where they have no row."""
+    return torch.cat([values.new_zeros(1, 4), values])[rows.long() + 1]
 
 
 def _through_time(grid: Tensor, points: Tensor, time: Tensor) -> Float[Tensor, "b s 4"]:
@@ -77,5 +91,9 @@ def _example(generator: torch.Generator, size: int) -> tuple[object, ...]:
     toward = torch.tensor([0.0, 0.0, 1.5]) + 0.2 * values(count, 3)
     time = 2 * torch.rand(count, generator=generator) - 1
     place = torch.rand(count, 12, generator=generator).sort(-1).values
-    moving = [2 * values(5, 4, 5, 6, 4), 2 * values(2, 3, 2, 2, 4)]
-    return start, toward, time, place, [2 * values(5, 6, 7, 4), 2 * values(3, 2, 4, 4)], moving
+    still = [2 * values(5, 6, 7, 4), 2 * values(3, 2, 4, 4)]
+    whole = torch.arange(2 * 3 * 2 * 2, dtype=torch.int32).view(2, 3, 2, 2)
+    some = torch.rand(5, 4, 5, 6, generator=generator) < 0.4
+    rows = [torch.where(some, some.view(-1).cumsum(0).view(some.shape) - 1, -1).int(), whole]
+    moving = [2 * values(int(some.sum()), 4), 2 * values(whole.numel(), 4)]
+    return start, toward, time, place, still, moving, rows

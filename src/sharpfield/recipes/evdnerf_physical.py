@@ -51,13 +51,14 @@ PAPER = Paper(
 class WindowOptions:
     """Which windows of events are looked at, and how far each is trusted."""
 
-    spans: int = 384
+    spans: int = 128
     """Windows drawn per step that begin and end with an event."""
-    counted: int = 384
+    counted: int = 640
     """Other windows drawn per step."""
     busy: float = 0.5
     """Share of these that hold an event for certain; the others are of any pixel."""
-    lengths: Lengths = field(default_factory=Lengths)
+    lengths: Lengths = Lengths(shortest=1 / 8)
+    """Long ones tell most: one end often sees what stands still. Spans may be short."""
     pull: float = 0.2
     """How much of the difference counts where it may be what is left over."""
     threshold: tuple[float, float] | None = None

@@ -15,11 +15,11 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
-from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels
+from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels, moving_shapes
 from sharpfield.geometry.centred import centred
 from sharpfield.ops.event_index import EventIndex
 from sharpfield.ops.voxel_march import THIN
-from sharpfield.recipes.swept import swept
+from sharpfield.recipes.swept import hull
 from sharpfield.rendering.march_through_time import SpaceTime, ThroughBox
 
 FOG_POINTS = 2048
@@ -34,12 +34,14 @@ class MovingOptions:
     """The field, and how rays sample it."""
 
     size: SpaceTimeSize = field(default_factory=SpaceTimeSize)
-    steps: int = 48
+    steps: int = 64
     """Of a ray from side to side of the box."""
     clear: float = -3.0
     """First raw density of what stands still: nearly empty, as events do not say what is there."""
     hull: bool = True
-    """Voxels move only where every camera that stands still saw events."""
+    """Voxels move only where and when every camera that stands still sees something move."""
+    solid: float = 6.0
+    """First raw density of what moves, where they do: nearly opaque."""
     empty: float = 3.0
     """Weight of how dense the box is: what nothing speaks for stays empty."""
     smooth: float = 0.1
@@ -65,10 +67,14 @@ class MovingScene(nn.Module):
         self.options, self.seed = options, seed
         self.capture, self.change = centred(capture)
         self.path = self.capture.trajectory
-        self.field = SpaceTimeVoxels(options.size, clear=options.clear)
+        hulls = None
         if options.hull and index is not None:
-            for level, grid in enumerate(self.field.moving):
-                self.field.freeze(level, ~swept(self.capture, index, grid.shape[1]))
+            shapes = moving_shapes(options.size)
+            hulls = [hull(self.capture, index, cells, moments) for moments, cells in shapes]
+        where = [one.possible for one in hulls if one is not None] if hulls else None
+        self.field = SpaceTimeVoxels(options.size, where or None, options.clear)
+        if hulls and hulls[0] is not None:
+            self.field.fill(hulls[0].solid, options.solid)
         self.view = ThroughBox(cast(SpaceTime, self.field), step=2 / options.steps)
 
     @property
@@ -82,13 +88,18 @@ class MovingScene(nn.Module):
 
     def roughness(self, step: int) -> Tensor:
         """How rough what moves is in space, and how much it changes, at one random moment."""
-        grid = self.field.moving[0]
         random = generator(self.seed, step, "moment")
-        moment = int(torch.randint(len(grid) - 1, (), generator=random))
-        part = grid[moment : moment + 2]
-        across = [part.diff(dim=axis).square().mean() for axis in (1, 2, 3)]
-        changes = part.diff(dim=0).square().mean()
-        return self.options.smooth * torch.stack(across).sum() + self.options.steady * changes
+        last = len(self.field.rows[0]) - 1
+        moment = int(torch.randint(last, (), generator=random))
+        part, held = self.field.moments(moment, 2)
+
+        def changed(axis: int) -> Tensor:
+            ends = [held.narrow(axis, k, held.shape[axis] - 1) for k in (0, 1)]
+            both = (ends[0] & ends[1])[..., None]
+            return (part.diff(dim=axis).square() * both).sum() / both.sum().clamp_min(1) / 4
+
+        across = torch.stack([changed(axis) for axis in (1, 2, 3)]).sum()
+        return self.options.smooth * across + self.options.steady * changed(0)
 
     def fog(self, step: int) -> Tensor:
         """How dense the box is at random points, at one random moment.

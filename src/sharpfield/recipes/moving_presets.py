@@ -56,15 +56,15 @@ def d_nerf_paper(recipe: DNeRF) -> DNeRF:
 
 def physical_draft(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
     """Minutes on two processor cores."""
-    windows = replace(recipe.windows, spans=192, counted=192)
-    return replace(recipe.lasting(4000), windows=windows)
+    windows = replace(recipe.windows, spans=64, counted=320)
+    return replace(recipe.lasting(2000), windows=windows)
 
 
 def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
     """Finer in space and time; an hour on a processor."""
-    size = SpaceTimeSize(still=96, moving=56, moments=40)
+    size = SpaceTimeSize(still=96, moving=80, moments=48)
     scene = replace(recipe.scene, size=size, steps=96)
-    windows = replace(recipe.windows, spans=768, counted=768)
+    windows = replace(recipe.windows, spans=256, counted=1280)
     return replace(recipe.lasting(12_000), scene=scene, windows=windows)
 
 

@@ -25,7 +25,12 @@ class SpaceTime(Protocol):
 
     @property
     def moving(self) -> Sequence[Tensor]:
-        """Grids of what moves."""
+        """Values of what moves."""
+        ...
+
+    @property
+    def rows(self) -> Sequence[Tensor]:
+        """Which cells have them."""
         ...
 
     def background(self) -> Float[Tensor, "3"]:
@@ -63,6 +68,7 @@ class ThroughBox:
             place.contiguous(),
             list(self.field.still),
             list(self.field.moving),
+            list(self.field.rows),
         )
         rgb = seen[:, :3] + (1 - seen[:, 4:]) * self.field.background()
         return Radiance(rgb, seen[:, 3], seen[:, 4], flat.weight).reshape(*rays.shape)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -25,14 +25,16 @@ def _(
     time: Float[Tensor, "b"],
     place: Float[Tensor, "b s"],
     still: Sequence[Float[Tensor, "_ _ _ 4"]],
-    moving: Sequence[Float[Tensor, "_ _ _ _ 4"]],
+    moving: Sequence[Float[Tensor, "_ 4"]],
+    rows: Sequence[Int32[Tensor, "_ _ _ _"]],
 ) -> Float[Tensor, "b 5"]:
     rays = (origin, direction, time, place)
     grids = (*still, *moving)
     if any(x.requires_grad for x in rays) or any(grid.dtype != torch.float32 for grid in grids):
-        return march_through_time.reference(*rays, still, moving)
+        return march_through_time.reference(*rays, still, moving, rows)
     given = [x.contiguous() for x in rays]
-    return _March.apply(*given, len(still), *[grid.contiguous() for grid in grids])
+    where = tuple(memory(x.contiguous()) for x in rows)
+    return _March.apply(*given, where, *[grid.contiguous() for grid in grids])
 
 
 class _March(torch.autograd.Function):
@@ -43,18 +45,18 @@ class _March(torch.autograd.Function):
         direction: Tensor,
         time: Tensor,
         place: Tensor,
-        still: int,
+        where: tuple[np.ndarray, ...],
         *grids: Tensor,
     ) -> Tensor:
         ctx.save_for_backward(origin, direction, time, place, *grids)
-        ctx.still = still
+        ctx.where = where
         out = torch.empty(len(origin), 5)
         rays = tuple(memory(x) for x in (origin, direction, time, place))
         learning = any(ctx.needs_input_grad)
         traces = len(origin) if learning else torch.get_num_threads()
         trace = np.empty((traces, place.shape[1], COLUMNS), np.float32)
         kept = np.empty(len(origin), np.int64)
-        spread(_forward, _field(grids, still), rays, learning, (trace, kept), memory(out))
+        spread(_forward, _field(grids, where), rays, learning, (trace, kept), memory(out))
         ctx.met = (trace, kept) if learning else None
         return out
 
@@ -64,33 +66,35 @@ class _March(torch.autograd.Function):
         origin, direction, time, place, *grids = ctx.saved_tensors
         rays = tuple(memory(x) for x in (origin, direction, time, place))
         sums = [np.zeros((PARTS, *grid.shape), np.float32) for grid in grids]
+        still = len(grids) - len(ctx.where)
         parts = tuple(
-            (tuple(s[k] for s in sums[: ctx.still]), tuple(s[k] for s in sums[ctx.still :]))
+            (tuple(s[k] for s in sums[:still]), tuple(s[k] for s in sums[still:]))
             for k in range(PARTS)
         )
         wanted = memory(gradients[0].contiguous())
-        spread(_backward, _field(grids, ctx.still), rays, ctx.met, wanted, parts)
+        spread(_backward, _field(grids, ctx.where), rays, ctx.met, wanted, parts)
         for total in sums:
             spread(_merge, total.reshape(PARTS, -1))
         return None, None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
 
 
-def _field(grids: Sequence[Tensor], still: int) -> tuple[Any, ...]:
-    """Still and moving grids as kernels see them."""
+def _field(grids: Sequence[Tensor], where: tuple[np.ndarray, ...]) -> tuple[Any, ...]:
+    """Still grids, and tables and rows of moving ones, as kernels see them."""
     views = [memory(grid) for grid in grids]
-    return tuple(views[:still]), tuple(views[still:])
+    still = len(views) - len(where)
+    return tuple(views[:still]), tuple(views[still:]), where
 
 
 @kernel
-def _moment(grid, time):
+def _moment(rows, time):
     """The moment before a time, and the share of the next one."""
-    at = (min(max(time, -1.0), 1.0) + 1.0) * 0.5 * (len(grid) - 1)
-    first = min(int(at), len(grid) - 2)
+    at = (min(max(time, -1.0), 1.0) + 1.0) * 0.5 * (len(rows) - 1)
+    first = min(int(at), len(rows) - 2)
     return first, np.float32(at - first)
 
 
 @kernel
-def _look_between(grid, first, later, corner, weight, found):
+def _look_between(values, rows, first, later, corner, weight, found):
     """Add the values at a located point between two moments."""
     a, b, c, d = found[0], found[1], found[2], found[3]
     for t in range(2):
@@ -100,20 +104,43 @@ def _look_between(grid, first, later, corner, weight, found):
             for j in range(2):
                 wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
                 for i in range(2):
-                    w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
-                    cell = grid[first + t, corner[2] + k, corner[1] + j, corner[0] + i]
-                    a += w * cell[0]
-                    b += w * cell[1]
-                    c += w * cell[2]
-                    d += w * cell[3]
+                    row = rows[first + t, corner[2] + k, corner[1] + j, corner[0] + i]
+                    if row >= 0:
+                        w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                        cell = values[row]
+                        a += w * cell[0]
+                        b += w * cell[1]
+                        c += w * cell[2]
+                        d += w * cell[3]
     found[0], found[1], found[2], found[3] = a, b, c, d
+
+
+@kernel
+def _add_between(total, rows, first, later, corner, weight, slope):
+    """Add to the sixteen cells around a located point, before and after its time."""
+    a, b, c, d = slope
+    for t in range(2):
+        wt = later if t else np.float32(1.0) - later
+        for k in range(2):
+            wz = wt * (weight[2] if k else np.float32(1.0) - weight[2])
+            for j in range(2):
+                wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
+                for i in range(2):
+                    row = rows[first + t, corner[2] + k, corner[1] + j, corner[0] + i]
+                    if row >= 0:
+                        w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                        cell = total[row]
+                        cell[0] += w * a
+                        cell[1] += w * b
+                        cell[2] += w * c
+                        cell[3] += w * d
 
 
 @kernel
 def _look_everywhere(field, x, y, z, time, scratch):
     """What all grids together hold at a point and a time; False outside."""
     found, corner, weight = scratch
-    still, moving = field
+    still, moving, rows = field
     found[:] = 0.0
     if not (-1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0):
         return False
@@ -121,9 +148,9 @@ def _look_everywhere(field, x, y, z, time, scratch):
         locate(still[level], x, y, z, corner, weight)
         look(still[level], corner, weight, found)
     for level in range(len(moving)):
-        first, later = _moment(moving[level], time)
-        locate(moving[level][0], x, y, z, corner, weight)
-        _look_between(moving[level], first, later, corner, weight, found)
+        first, later = _moment(rows[level], time)
+        locate(rows[level][0], x, y, z, corner, weight)
+        _look_between(moving[level], rows[level], first, later, corner, weight, found)
     return True
 
 
@@ -131,17 +158,15 @@ def _look_everywhere(field, x, y, z, time, scratch):
 def _add_everywhere(field, x, y, z, time, scratch, slope, own):
     """Add the gradient of what all grids hold at a point inside to that of their cells."""
     _, corner, weight = scratch
-    still, moving = field
+    still, _, rows = field
     a, b, c, d = slope
     for level in range(len(still)):
         locate(still[level], x, y, z, corner, weight)
         add(own[0][level], corner, weight, a, b, c, d)
-    for level in range(len(moving)):
-        first, later = _moment(moving[level], time)
-        locate(moving[level][0], x, y, z, corner, weight)
-        now = np.float32(1.0) - later
-        add(own[1][level][first], corner, weight, now * a, now * b, now * c, now * d)
-        add(own[1][level][first + 1], corner, weight, later * a, later * b, later * c, later * d)
+    for level in range(len(rows)):
+        first, later = _moment(rows[level], time)
+        locate(rows[level][0], x, y, z, corner, weight)
+        _add_between(own[1][level], rows[level], first, later, corner, weight, slope)
 
 
 @kernel
