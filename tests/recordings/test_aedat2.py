@@ -232,3 +232,9 @@ fuzz.register("aedat2", fuzz.Case(original, open_aedat2, ".aedat", most_per_byte
 def test_damaged_files(tmp_path: Path) -> None:
     outcomes = fuzz.campaign("aedat2", files=200, folder=tmp_path)
     assert outcomes["refused"] and outcomes["partial"]
+
+
+def test_cameras_by_their_former_names(tmp_path: Path) -> None:
+    for chip, size in (("sbret10.SBret10", (240, 180)), ("retina.Tmpdiff128", (128, 128))):
+        path = recorded(tmp_path / "a.aedat", HEADER + f"# AEChip: eu.ini.chips.{chip}\n", [])
+        assert open_aedat2(path).size == size

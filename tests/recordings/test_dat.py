@@ -124,3 +124,11 @@ def test_damaged_files_end_cleanly(tmp_path: Path) -> None:
 def test_files_that_do_not_do(header: str, kind: int, message: str, tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=message):
         open_dat(write(tmp_path, record(1, 2, 3, 1), header=header, kind=kind))
+
+
+@pytest.mark.parametrize("version", ["% Version 2.0\n", "% version 2\n", "%Version 2\r\n"])
+def test_versions_of_many_hands(version: str, tmp_path: Path) -> None:
+    header = f"{version}% geometry 640x480\n"
+    recording = open_dat(write(tmp_path, record(500, 400, 7, 1), header=header))
+    assert recording.size == (640, 480)
+    assert listed(recording.load()) == [(500, 400, 7, 1)]

@@ -6,6 +6,7 @@ import pytest
 from sharpfield.core import CaptureError, EventStream, OptionError
 from sharpfield.recordings import Trouble
 from sharpfield.recordings.evt import decoded, open_evt, trigger_edges
+from sharpfield.recordings.open import format_of
 from sharpfield.storage import writing_evt
 from tests.recordings import fuzz
 from tests.streams import random_events
@@ -425,3 +426,48 @@ def test_another_encoding_is_noticed(tmp_path: Path) -> None:
 def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="recording not found"):
         open_evt(tmp_path / "no.raw")
+
+
+# Headers as other programs write them
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "% evt 3.0\r\n% geometry 64x48\r\n% end\r\n",
+        "% EVT 3.0\n% Width 64\n% Height 48\n",
+        "%evt 3\n%width 64\n%height 48\n%end\n",
+        "% format EVT3;Height=48;Width=64\n%\n% end\n",
+        "% format EVT3.0\n% geometry 64 x 48\n% END\n",
+        "% evt 3.0\n% geometry\t64X48\n% remark \u00e4\n% end\n",
+    ],
+)
+def test_headers_of_many_hands(header: str, tmp_path: Path) -> None:
+    data = evt3(high3(0), low3(1), y3(1), base3(56, 1), 0x4FFF, x3(63, 0))
+    for encoding in ("utf-8", "latin-1"):
+        path = write(tmp_path, header.encode(encoding), data)
+        assert format_of(path) == "evt"
+        recording = open_evt(path)
+        assert recording.size == (64, 48)
+        # The vector crosses the right edge.
+        found = [(x, p) for x, _, _, p in listed(recording.load())]
+        assert found == [(56 + i, 1) for i in range(8)] + [(63, -1)]
+        assert str(recording.trouble) == "4 events outside the sensor"
+
+
+def test_a_header_alone_whose_last_line_does_not_end(tmp_path: Path) -> None:
+    for last in ("% geometry 64x48", "% geometry 64x48\n% end"):
+        recording = open_evt(write(tmp_path, f"% evt 3.0\n{last}"))
+        assert recording.size == (64, 48) and not len(recording.load())
+
+
+def test_the_caller_decides_between_sizes(tmp_path: Path) -> None:
+    path = write(tmp_path, "% evt 3.0\n% geometry 64x48\n% width 32\n% height 24\n% end\n")
+    assert open_evt(path, size=(32, 24)).size == (32, 24)
+    with pytest.raises(CaptureError, match="more than one size"):
+        open_evt(path, size=(16, 16))
+    path = write(tmp_path, "% evt 3.0\n% plugin_name hal_plugin_gen31_fx3\n% end\n")
+    assert open_evt(path, size=(320, 240)).size == (320, 240)
+    path = write(tmp_path, "% evt 3.0\n% geometry 64x48\n% end\n")
+    with pytest.raises(CaptureError, match="the size given is not the one in the file"):
+        open_evt(path, size=(320, 240))

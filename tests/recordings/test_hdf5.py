@@ -65,9 +65,35 @@ def v2e(file: h5py.File) -> None:
     file["events"] = np.stack([EVENTS.t_us, EVENTS.x, EVENTS.y, EVENTS.p > 0], -1).astype(np.uint32)
 
 
+def tum_vie(file: h5py.File) -> None:
+    dsec(file)
+    del file["t_offset"]
+    del file["events/t"]
+    file["events"].create_dataset("t", data=EVENTS.t_us, compression="gzip", shuffle=True)
+
+
+def offset_of_one_entry(file: h5py.File) -> None:
+    dsec(file)
+    del file["t_offset"], file["ms_to_idx"]
+    file["t_offset"] = np.array([1000])
+
+
+def prophesee(file: h5py.File) -> None:
+    kind = [("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")]
+    records = np.empty(len(EVENTS), kind)
+    columns = (EVENTS.x, EVENTS.y, EVENTS.p > 0, EVENTS.t_us)
+    for name, column in zip("xypt", columns, strict=True):
+        records[name] = column
+    file.create_dataset("CD/events", data=records, chunks=(100,), compression="gzip")
+    file.attrs["geometry"] = f"{WIDTH}x{HEIGHT}"
+
+
 @pytest.mark.parametrize(
     ("write", "layout", "options", "offset_us"),
     [
+        (tum_vie, "HDF5", {"size": SIZE}, 0),
+        (offset_of_one_entry, "HDF5", {"size": SIZE}, 0),
+        (prophesee, "Prophesee HDF5", {}, 0),
         (dsec, "HDF5", {"size": SIZE}, 0),
         (flat, "HDF5", {"size": SIZE, "unit": "us"}, 0),
         (m3ed, "M3ED", {"topic": "left"}, 0),
@@ -143,7 +169,7 @@ def test_one_of_several_cameras_has_to_be_named(tmp_path):
 
 def test_what_is_no_file_of_events(tmp_path):
     with h5py.File(tmp_path / "e.h5", "w") as file:
-        file["CD/events"] = np.zeros(3, [("x", "u2"), ("y", "u2"), ("p", "i2"), ("t", "i8")])
+        file["CD/indexes"] = np.zeros(3)
     with pytest.raises(CaptureError, match="convert Prophesee's own HDF5"):
         open_hdf5(tmp_path / "e.h5", size=SIZE)
     (tmp_path / "e.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
@@ -185,6 +211,21 @@ def test_a_part_that_cannot_be_unpacked_ends_the_events(tmp_path, monkeypatch):
     recording = open_hdf5(path, size=SIZE)
     assert len(recording.load()) == 200
     assert str(recording.trouble) == "300 events from a damaged part onwards"
+
+
+def test_the_packing_of_prophesee_needs_its_plugin(tmp_path):
+    kind = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_chunk((100,))
+        settings.set_filter(0x8ECF, h5py.h5z.FLAG_OPTIONAL, ())
+        space = h5py.h5s.create_simple((100,))
+        h5py.h5d.create(
+            file.create_group("CD").id, b"events", h5py.h5t.py_create(kind), space, settings
+        )
+    with pytest.raises(CaptureError, match="compressed in a way that cannot be read") as caught:
+        open_hdf5(tmp_path / "e.h5", size=SIZE)
+    assert "Prophesee's ECF" in str(caught.value)
 
 
 def _bytes(write: Callable) -> Callable[[], bytes]:

@@ -7,6 +7,7 @@ import pytest
 
 from sharpfield.core import CaptureError, EventStream, OptionError
 from sharpfield.recordings import text
+from sharpfield.recordings.open import format_of
 from sharpfield.recordings.text import open_text
 from sharpfield.storage import exporting_events
 from tests.recordings import fuzz
@@ -187,3 +188,11 @@ def test_options_that_do_not_do(tmp_path: Path) -> None:
         open_text(path, size=DAVIS, columns="xyzt")
     with pytest.raises(OptionError, match="unknown unit"):
         open_text(path, size=DAVIS, unit="h")
+
+
+def test_tables_of_prophesee(tmp_path: Path) -> None:
+    path = write(tmp_path, "%geometry:64,48\n3,4,1,1000007\n5,6,0,1000009", "cd.csv")
+    assert format_of(path) == "text"
+    recording = open_text(path, unit="us", columns="xypt")
+    assert recording.size == (64, 48)
+    assert listed(recording.load()) == [(1000007, 3, 4, 1), (1000009, 5, 6, -1)]

@@ -40,7 +40,9 @@ LONGEST_HEADER, LONGEST_LINE = 2**20, 2**14
 
 CAMERAS = {
     "dvs128": (128, 128),
+    "tmpdiff128": (128, 128),
     "davis240": (240, 180),
+    "sbret10": (240, 180),
     "davis208": (208, 192),
     "davis346": (346, 260),
     "davis640": (640, 480),
@@ -89,7 +91,9 @@ def open_aedat2(path: Path, *, size: tuple[int, int] | None = None) -> Recording
     stated = next((size for name, size in CAMERAS.items() if name in chip.lower()), None)
     size = known_size(stated, size, path)
     if size not in CAMERAS.values():
-        known = ", ".join(f"{width} x {height}" for width, height in CAMERAS.values())
+        known = ", ".join(
+            f"{width} x {height}" for width, height in dict.fromkeys(CAMERAS.values())
+        )
         raise CaptureError(
             "addresses of this camera are not known",
             where=path,

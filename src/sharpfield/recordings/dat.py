@@ -58,9 +58,9 @@ def open_dat(path: Path | str, *, size: tuple[int, int] | None = None) -> Record
     path = Path(path)
     header = read_header(path)
     edges = _kind(header, path) == EDGES
-    stated = stated_size(header, path)
+    stated = stated_size(header, path, size)
     size = stated or size if edges else known_size(stated, size, path)
-    version = 2 if (header.number("Version") or 0) >= 2 else 1
+    version = 2 if (header.number("version") or 0) >= 2 else 1
     trouble = Trouble()
 
     def records() -> Iterator[bytes]:

@@ -58,8 +58,10 @@ ENCODINGS = {
     "evt3": Encoding("EVT3", "<u2", decode_evt3),
 }
 
-VERSIONS = {"2.0": "evt2", "2.1": "evt2.1", "3.0": "evt3"}
-NAMES = {"EVT2": "evt2", "EVT21": "evt2.1", "EVT3": "evt3"}
+VERSIONS = {"2.0": "evt2", "2": "evt2", "2.1": "evt2.1", "3.0": "evt3", "3": "evt3"}
+NAMES = {f"EVT{version.replace('.', '')}": name for version, name in VERSIONS.items()} | {
+    f"EVT{version}": name for version, name in VERSIONS.items()
+}
 
 COUNTS = {
     UNTIMED: "events before the first time",
@@ -84,7 +86,7 @@ def open_evt(
     path = Path(path)
     header = read_header(path)
     chosen = _encoding(header, path, encoding)
-    size = known_size(stated_size(header, path), size, path)
+    size = known_size(stated_size(header, path, size), size, path)
     origin_us = header.number("time_origin_us") or 0
     bayer = header.fields.get("bayer", "")
     trouble = Trouble()
@@ -233,7 +235,7 @@ def _encoding(header: Header, path: Path, given: str | None) -> str:
             got="a header without `evt` or `format`" if header.length else "no header",
             do=f"give the encoding: one of {', '.join(ENCODINGS)}",
         )
-    found = NAMES.get(name) if name else VERSIONS.get(version)
+    found = NAMES.get(name.upper()) if name else VERSIONS.get(version)
     if found is None:
         raise CaptureError(
             "events are encoded in a way that cannot be read here",
@@ -257,5 +259,5 @@ def _halves_swapped(header: Header, path: Path) -> bool:
             do="convert the file with the maker's tools",
         )
     maker = header.fields.get("integrator_name", "Prophesee")
-    system = header.number("system_ID")
+    system = header.number("system_id")
     return maker == "Prophesee" and system is not None and 0 < system < LEGACY_BEFORE

@@ -7,16 +7,20 @@
     E2VID, event_utils       events/{xs, ys, ts, ps}; s; images/image%09d with a time each
     MVSEC                    davis/{left, right}/events, rows x, y, t, p; s; image_raw, image_raw_ts
     v2e                      events, rows t, x, y, p; us
+    Prophesee                CD/events, records x, y, p, t; us
 
 Where a file holds several cameras, the caller names one; frames are those of the same side unless
 another camera is named for them. Frames of these files have one time each; how long the shutter was
 open they do not tell.
+
+Prophesee's files are packed in a way of their own (ECF): HDF5 needs their plug-in to read them.
 
 Source: Gehrig et al., *DSEC* (RA-L 2021); Klenk et al., *TUM-VIE* (IROS 2021); Chaney et al.,
 *M3ED* (CVPRW 2023); Stoffregen et al., *Reducing the Sim-to-Real Gap for Event Cameras* (ECCV
 2020); Zhu et al., *MVSEC* (RA-L 2018); Hu et al., *v2e* (CVPRW 2021).
 """
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -31,7 +35,12 @@ from sharpfield.recordings.columns import recording_of
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.storage.event_columns import known_unit, whole_us
 from sharpfield.storage.event_file import UNREADABLE, EventFile
-from sharpfield.storage.event_layouts import expect_filled, open_events, opened_hdf5
+from sharpfield.storage.event_layouts import (
+    expect_filled,
+    expect_filters,
+    open_events,
+    opened_hdf5,
+)
 
 CAMERA = "*"
 """Stands in a path for the name of one of several cameras."""
@@ -49,7 +58,7 @@ class Dialect:
     events: str
     """Path of the group of columns, or of the table."""
     columns: tuple[str, ...]
-    """Names of x, y, t, p in the group; or what the columns of the table are, in their order."""
+    """Names of x, y, t, p in the group, or of a record; or what the columns of the table are."""
     unit: str
     size: Callable[[h5py.File, str], tuple[int, int] | None] = lambda file, camera: None
     """How the file tells the size of its sensor."""
@@ -61,6 +70,9 @@ class Dialect:
     def table(self) -> bool:
         """Whether events are rows of one table."""
         return self.columns[0] in ("xytp", "txyp")
+
+    records: bool = False
+    """Whether events are records with these columns."""
 
     def cameras(self, file: h5py.File) -> list[str]:
         """The cameras whose events the file keeps in this way; [""] if there is no choice."""
@@ -77,15 +89,18 @@ class Dialect:
         return self.events.replace(CAMERA, camera).rstrip("/")
 
     def _holds(self, found: Any) -> bool:
+        if self.records:
+            named = isinstance(found, h5py.Dataset) and found.ndim == 1 and found.dtype.names
+            return bool(named) and set(self.columns) <= set(found.dtype.names)
         if self.table:
             return isinstance(found, h5py.Dataset) and found.ndim == 2 and found.shape[1] == 4
         return isinstance(found, h5py.Group) and set(self.columns) <= set(found)
 
 
 class TableColumn:
-    """One column of a table, read piece by piece."""
+    """One column of a table, or one field of records, read piece by piece."""
 
-    def __init__(self, table: h5py.Dataset, column: int) -> None:
+    def __init__(self, table: h5py.Dataset, column: int | str) -> None:
         self._table, self._column = table, column
 
     def __len__(self) -> int:
@@ -94,6 +109,8 @@ class TableColumn:
 
     def __getitem__(self, part: slice) -> np.ndarray:
         """Entries `part.start` to `part.stop`."""
+        if isinstance(self._column, str):
+            return self._table.fields(self._column)[part]
         return self._table[part, self._column]
 
 
@@ -176,11 +193,13 @@ def _event_file(
     with ExitStack() as resources:
         file = resources.enter_context(opened_hdf5(path))
         held: Any = file[dialect.at(camera)]
-        if dialect.table:
+        columns: dict[str, Any]
+        if dialect.table or dialect.records:
+            expect_filters(held, f"{path}, {held.name}")
             expect_filled(held, f"{path}, {held.name}")
-            order = dialect.columns[0]
-            columns: dict[str, Any] = {
-                name: TableColumn(held, order.index(name)) for name in "xytp"
+            places = dialect.columns if dialect.records else map(dialect.columns[0].index, "xytp")
+            columns = {
+                name: TableColumn(held, place) for name, place in zip("xytp", places, strict=True)
             }
         else:
             columns = {
@@ -244,6 +263,14 @@ def _attribute_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
     if len(stored) != 2 or stored.dtype.kind not in "iuf":
         return None
     return int(stored[1]), int(stored[0])
+
+
+def _geometry_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
+    """`geometry` is a text, "1280x720"."""
+    stored = file.attrs.get("geometry", "")
+    text = stored.decode("latin-1") if isinstance(stored, bytes) else str(stored)
+    match = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", text)
+    return (int(match[1]), int(match[2])) if match else None
 
 
 def _mvsec_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
@@ -322,5 +349,13 @@ DIALECTS = (
         f"davis/{CAMERA}/image_raw",
     ),
     Dialect("v2e HDF5", "events", ("txyp",), "us"),
+    Dialect(
+        "Prophesee HDF5",
+        "CD/events",
+        ("x", "y", "t", "p"),
+        "us",
+        _geometry_size,
+        records=True,
+    ),
 )
 """Ways to lay events out that `storage.open_events` does not know."""

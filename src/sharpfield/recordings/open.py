@@ -29,6 +29,8 @@ from sharpfield.storage.images import list_images
 HEAD = 4096
 """Bytes that are looked at."""
 
+TEXTS = (".txt", ".csv")
+
 Recognise = Callable[[Path, bytes], bool]
 """Takes the path and what the file begins with, which is nothing for a folder."""
 
@@ -164,12 +166,14 @@ def _begins(*magics: bytes) -> Recognise:
 
 
 def _is_evt(path: Path, head: bytes) -> bool:
-    lines = [line.lower() for line in head.split(b"\n") if line.startswith(b"%")]
-    return any(line.startswith((b"% evt ", b"% format evt")) for line in lines)
+    lines = [line[1:].lower().split() for line in head.split(b"\n") if line.startswith(b"%")]
+    words = [(*line, b"", b"")[:2] for line in lines]
+    return any(key == b"evt" or (key == b"format" and to.startswith(b"evt")) for key, to in words)
 
 
 def _is_dat(path: Path, head: bytes) -> bool:
-    return head.startswith(b"%") and not _is_evt(path, head) and path.suffix != ".raw"
+    other = path.suffix.lower() in (".raw", *TEXTS)
+    return head.startswith(b"%") and not _is_evt(path, head) and not other
 
 
 def _is_bag(path: Path, head: bytes) -> bool:
@@ -263,7 +267,7 @@ FORMATS: dict[str, Format] = {
         open_text,
         "events",
         "a zip of events.txt",
-        (".txt", ".csv"),
+        TEXTS,
         takes=("size", "unit", "columns"),
     ),
     "rpg-folder": Format(

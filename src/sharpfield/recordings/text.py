@@ -3,6 +3,7 @@
     t x y p     in this order unless a line of names says otherwise; t in seconds
     # ...       remarks, also with %
     240 180     a first line of two numbers is the size of the sensor (E2VID)
+    %geometry:1280,720          so is this (Prophesee)
     t_us,x,y,p  a line of names, as our own tables have
 
 Times with a decimal point are seconds; whole ones may be anything, unless the line of names tells
@@ -53,6 +54,9 @@ NAMES = {
     "y": "y",
 }
 """Columns by what tables call them."""
+
+SIZE = re.compile(r"[#%] *geometry *[:=]? *([0-9]{1,5}) *[xX,] *([0-9]{1,5})")
+"""A remark that gives the size of the sensor."""
 
 NAME = re.compile(rf"(?P<name>{'|'.join(NAMES)})[_\[(]*(?P<unit>s|ms|us|ns)?[\])]?")
 
@@ -134,8 +138,11 @@ def _beginning(text: bytes) -> Beginning:
     """What comes before the first event."""
     at, found = (3 if text.startswith(b"\xef\xbb\xbf") else 0), Beginning()
     while (stop := text.find(b"\n", at)) >= 0:
-        words = re.split(r"[\s,;]+", text[at:stop].decode("latin-1").strip())
-        if len(words) == 2 and all(re.fullmatch("[0-9]{1,5}", word) for word in words):
+        line = text[at:stop].decode("latin-1").strip()
+        words = re.split(r"[\s,;]+", line)
+        if sized := SIZE.fullmatch(line):
+            found = replace(found, size=(int(sized[1]), int(sized[2])))
+        elif len(words) == 2 and all(re.fullmatch("[0-9]{1,5}", word) for word in words):
             found = replace(found, length=stop + 1, size=(int(words[0]), int(words[1])))
         elif words[0][:1] not in ("", "#", "%"):
             named = [NAME.fullmatch(word.lower()) for word in words]

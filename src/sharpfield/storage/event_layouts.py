@@ -229,7 +229,7 @@ def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
         raise CaptureError(
             "an event column must be a one-dimensional array of numbers", where=where, got=column
         )
-    _expect_filters(column, where)
+    expect_filters(column, where)
     expect_filled(column, where)
     return column
 
@@ -255,7 +255,13 @@ def expect_filled(column: h5py.Dataset, where: str) -> None:
         )
 
 
-def _expect_filters(column: h5py.Dataset, where: str) -> None:
+def expect_filters(column: h5py.Dataset, where: str) -> None:
+    """Make sure that a data set can be unpacked.
+
+    Raises:
+        CaptureError: It is compressed in an unknown way.
+        MissingExtra: It is compressed by Blosc and the plugin is not installed.
+    """
     settings = column.id.get_create_plist()
     for i in range(settings.get_nfilters()):
         code = settings.get_filter(i)[0]
