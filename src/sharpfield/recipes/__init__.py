@@ -9,6 +9,7 @@ from typing import Any
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.d_nerf import DNeRF
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
+from sharpfield.recipes.ev_dynamic_splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 from sharpfield.recipes.hybrid import Hybrid
@@ -23,6 +24,8 @@ RECIPES: dict[str, Any] = {
     "d-nerf": DNeRF,
     "evdnerf": EvDNeRF,
     "evdnerf-physical": EvDNeRFPhysical,
+    "dynamic-splat": DynamicSplat,
+    "ev-dynamic-splat": EvDynamicSplat,
     "point-nerf": PointNeRF,
     "hybrid": Hybrid,
     "splat": Splat,
@@ -59,8 +62,10 @@ __all__ = [
     "DNeRF",
     "EvDNeRF",
     "EvDNeRFPhysical",
+    "DynamicSplat",
     "EdiSplat",
     "EvDeblurNeRF",
+    "EvDynamicSplat",
     "EvSplat",
     "EventSplat",
     "Hybrid",

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from sharpfield.fields.space_time import SpaceTimeSize
 from sharpfield.recipes.d_nerf import DNeRF
+from sharpfield.recipes.ev_dynamic_splat import DynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 
@@ -68,7 +69,22 @@ def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
     return replace(recipe.lasting(12_000), scene=scene, windows=windows)
 
 
+def dynamic_draft(recipe: DynamicSplat) -> DynamicSplat:
+    """Minutes on two processor cores."""
+    return recipe.lasting(5000)
+
+
+def dynamic_standard(recipe: DynamicSplat) -> DynamicSplat:
+    """More Gaussians, and more cameras and instants in each step; an hour on a processor."""
+    return replace(
+        recipe.lasting(20_000),
+        gaussians=replace(recipe.gaussians, density=3.0),
+        looks=replace(recipe.looks, cameras=4, instants=5),
+    )
+
+
 EVDNERF_VARIANTS = {"lego": lego, "real": real}
 EVDNERF_SIZES = {"draft": evdnerf_draft, "standard": evdnerf_standard, "paper": evdnerf_paper}
 D_NERF_SIZES = {"draft": d_nerf_draft, "standard": d_nerf_standard, "paper": d_nerf_paper}
 PHYSICAL_SIZES = {"draft": physical_draft, "standard": physical_standard}
+DYNAMIC_SIZES = {"draft": dynamic_draft, "standard": dynamic_standard}

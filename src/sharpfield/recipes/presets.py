@@ -16,6 +16,7 @@ from sharpfield.recipes.frame_term import FrameOptions
 from sharpfield.recipes.learned_blur import KernelOptions
 from sharpfield.recipes.moving_presets import (
     D_NERF_SIZES,
+    DYNAMIC_SIZES,
     EVDNERF_SIZES,
     EVDNERF_VARIANTS,
     PHYSICAL_SIZES,
@@ -193,6 +194,8 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
     "d-nerf": {},
     "evdnerf": EVDNERF_VARIANTS,
     "evdnerf-physical": {},
+    "dynamic-splat": {},
+    "ev-dynamic-splat": {},
     "point-nerf": {},
     "hybrid": HYBRID_VARIANTS,
     **dict.fromkeys(SPLATS, {"refine": refine}),
@@ -205,6 +208,8 @@ SIZES: Mapping[str, Mapping[str, Change]] = {
     "d-nerf": D_NERF_SIZES,
     "evdnerf": EVDNERF_SIZES,
     "evdnerf-physical": PHYSICAL_SIZES,
+    "dynamic-splat": DYNAMIC_SIZES,
+    "ev-dynamic-splat": DYNAMIC_SIZES,
     "point-nerf": POINT_SIZES,
     "hybrid": HYBRID_SIZES,
     **dict.fromkeys(SPLATS, {"draft": splat_draft, "standard": splat_standard}),

@@ -1,0 +1,202 @@
+"""The model of moving Gaussians: a scene, the looks of each step, and the unknowns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.captures import event_index
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.growth import Growth
+from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
+from sharpfield.core.protocols import PointSet
+from sharpfield.core.radiance import Radiance
+from sharpfield.core.rays import Rays
+from sharpfield.core.schedule import Group
+from sharpfield.core.views import Views
+from sharpfield.formation.mix import mix
+from sharpfield.formation.response import luma
+from sharpfield.formation.tone import tone_of
+from sharpfield.geometry.centred import centred
+from sharpfield.recipes.ev_dynamic_looks import RigLookOptions, RigLooks
+from sharpfield.recipes.ev_dynamic_scene import DynamicOptions, DynamicScene
+from sharpfield.recipes.unknowns import (
+    FLOOR,
+    UnknownOptions,
+    Unknowns,
+    falling,
+    pose_groups,
+    with_learned_poses,
+)
+from sharpfield.recipes.window_terms import changes, count_error, threshold_error
+
+Terms = dict[str, Tensor]
+
+
+@runtime_checkable
+class DynamicNumbers(Protocol):
+    """The numbers of a recipe on moving Gaussians."""
+
+    @property
+    def steps(self) -> int:
+        """Length of the schedule."""
+        ...
+
+    @property
+    def gaussians(self) -> DynamicOptions:
+        """What the scene is made of."""
+        ...
+
+    @property
+    def looks(self) -> RigLookOptions:
+        """What steps look at."""
+        ...
+
+    @property
+    def unknowns(self) -> UnknownOptions:
+        """What else is learned."""
+        ...
+
+
+class DynamicModel(nn.Module):
+    """Moving Gaussians on one capture. Frames, events, or both: what is missing is left out.
+
+    Args:
+        recipe: With `gaussians`, `looks`, `unknowns` and `steps`.
+        capture: As read.
+        seed: Of the run.
+    """
+
+    def __init__(self, recipe: DynamicNumbers, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.recipe, self.seed = recipe, seed
+        moved, self.change = centred(_checked(capture))
+        self.capture = with_learned_poses(moved, recipe.unknowns)
+        self.path = self.capture.trajectory
+        self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
+        self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
+        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps)
+        # Without frames nothing says what stands still but what passes before it.
+        alone = recipe.looks.still if capture.frames is not None else 0.0
+        self.scene = DynamicScene(
+            recipe.gaussians,
+            self.capture,
+            None if capture.events is None else event_index(capture.events),
+            self.tone,
+            steps=recipe.steps,
+            still_until=int(alone * recipe.steps),
+            seed=seed,
+        )
+        self.floor = float(capture.notes.get("log_floor", FLOOR))
+
+    @property
+    def heaviest_step(self) -> int:
+        """The first step that looks at several instants."""
+        return min(self.looks.late_from, max(self.recipe.steps - 1, 0))
+
+    def draw(self, step: int) -> Batch:
+        """Several cameras at the same few instants."""
+        batch = self.looks.draw(step, self.unknowns.belief())
+        device = self.scene.behind.device
+        return {name: seen.to(device) for name, seen in batch.items()}
+
+    def losses(self, batch: Batch, step: int) -> Terms:
+        """Errors of sharp pictures, of frames, and of the events between instants."""
+        assert isinstance(look := batch["look"], Instants)
+        frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
+        only_events = events is not None and frames is None
+        time = self.unknowns.on_time(look.time) if only_events else look.time
+        pose = self.path.pose(time, look.track)
+        light = self.scene.draw(Views(pose, time, look.weight, look.corner, look.size), step=step)
+        terms = self.scene.terms()
+        options, unknowns = self.recipe.looks, self.unknowns
+        if isinstance(frames, Pixels):
+            exposed = replace(light, rgb=self._exposed(light.rgb, frames))
+            terms["blur"] = (mix(exposed, outer=self.tone.encode) - frames.value).abs().mean()
+        if isinstance(sharp, Pixels):
+            weight = options.sharp if isinstance(frames, Pixels) else 1.0
+            stored = self.tone.encode(light.rgb)
+            terms["sharp"] = weight * (stored - sharp.value).abs().mean()
+        if isinstance(events, EventPairs):
+            change = changes(light, events, unknowns.response)
+            terms["events"] = options.windows * count_error(change, events, unknowns.thresholds)
+            if unknowns.learns_thresholds:
+                off = threshold_error(change, events, unknowns.thresholds)
+                terms["thresholds"] = options.windows * off
+        if (prior := unknowns.prior()) is not None:
+            terms["prior"] = prior
+        return terms
+
+    def _exposed(self, light: Float[Tensor, "m h w k c"], seen: Pixels) -> Tensor:
+        if self.unknowns.log_gain is None:
+            return light
+        gain = self.unknowns.log_gain[seen.frame[:, 0, 0]].exp()
+        return light * gain[:, None, None, None, None]
+
+    def draw_views(self, views: Views) -> Radiance:
+        """Sharp linear light of whole views."""
+        return self.scene.draw(views)
+
+    def through(self, camera: Camera) -> "OtherLens":
+        """The same scene, seen by another camera than the capture's."""
+        return OtherLens(self.scene, camera)
+
+    def render(self, rays: Rays) -> Radiance:
+        """Not possible: Gaussians are drawn as whole views.
+
+        Raises:
+            OptionError: Always.
+        """
+        raise OptionError(
+            "a scene of Gaussians draws whole views, not scattered rays",
+            got=f"{rays.weight.numel()} rays",
+            do="call draw_views",
+        )
+
+    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """As the frames store it."""
+        return self.tone.encode(light).clamp(0, 1)
+
+    def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+        """As the event camera sees it."""
+        return (luma(light)[..., 0] + self.floor).log()
+
+    def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
+        """What becomes of the Gaussians after a step."""
+        return self.scene.grow(step)
+
+    def groups(self) -> list[Group]:
+        """Gaussians, unknowns and poses."""
+        steps = max(self.recipe.steps, 1)
+        return [
+            *self.scene.groups(),
+            *self.unknowns.groups(steps),
+            *pose_groups(self.capture, falling(self.recipe.unknowns.poses_rate, steps)),
+        ]
+
+
+@dataclass(frozen=True)
+class OtherLens:
+    """A moving scene in front of a camera that did not record it."""
+
+    scene: DynamicScene
+    camera: Camera
+
+    def draw_views(self, views: Views) -> Radiance:
+        """Sharp linear light of whole views."""
+        return self.scene.draw(views, replace(self.scene.splatting, camera=self.camera))
+
+
+def _checked(capture: Capture) -> Capture:
+    if capture.camera.lens != "pinhole":
+        raise OptionError(
+            "splats are drawn for lenses without distortion",
+            where=capture.name,
+            got=f"a {capture.camera.lens} lens",
+            do="undistort frames and events first, or use a recipe that renders rays",
+        )
+    return capture
