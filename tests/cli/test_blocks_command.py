@@ -49,9 +49,16 @@ def test_blocks_become_one_run_of_what_lies_in_each(alone: Path):
 
 
 def test_a_finished_command_does_nothing_again(capture: Path, alone: Path):
-    before = tensors(alone / "blocks" / "1of2"), tensors(alone)
-    assert run("blocks", "room-splat", str(capture), "--out", str(alone), *TRAINED, *SMALL) == 0
-    assert (tensors(alone / "blocks" / "1of2"), tensors(alone)) == before
+    command = ("blocks", "room-splat", str(capture), "--out", str(alone), *TRAINED, *SMALL)
+    before, merged = tensors(alone / "blocks" / "1of2"), file_of(alone, "last")
+    written, whole = merged.stat().st_mtime_ns, tensors(alone)
+    assert run(*command) == 0
+    assert tensors(alone / "blocks" / "1of2") == before
+    assert merged.stat().st_mtime_ns == written, "it is up to date"
+    block = file_of(alone / "blocks" / "2of2", "last")
+    os.utime(block, ns=(written + 1, written + 1))
+    assert run(*command) == 0
+    assert merged.stat().st_mtime_ns > written and tensors(alone) == whole, "a block is newer"
 
 
 def test_finished_blocks_of_other_settings_are_refused(

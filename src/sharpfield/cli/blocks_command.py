@@ -19,7 +19,7 @@ from sharpfield.recipes import recipe_named
 from sharpfield.recipes.merge import merge
 from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.saved import Started, read_started, write_started
-from sharpfield.training import Ledger, Options, adam, read_ledger
+from sharpfield.training import Ledger, Options, adam, file_of, read_ledger
 from sharpfield.training.checkpoint import Progress, check_settings, save_last
 from sharpfield.training.record import write_ledger
 
@@ -83,9 +83,11 @@ def blocks(
         console.print(f"Block {block.block}", highlight=False)
         going_on = replace(options, resume=options.resume or done is not None)
         start(block, source, runs[i], going_on, device=where, console=console)
-    ledgers = [read_ledger(run) for run in runs]
-    if all(ledger is not None and ledger.finished for ledger in ledgers):
-        _merge(whole, source, out, runs, [ledger for ledger in ledgers if ledger is not None])
+    ledgers = [ledger for run in runs if (ledger := read_ledger(run)) is not None]
+    if len(ledgers) == count and all(ledger.finished for ledger in ledgers):
+        together = _together(ledgers)
+        if not _up_to_date(whole, together, out, runs):
+            _merge(whole, source, out, runs, together)
         console.print(f"Merged. `sharpfield evaluate {out}` measures it.", highlight=False)
 
 
@@ -95,24 +97,33 @@ def _mine(count: int, environment: Mapping[str, str]) -> range:
     return range(rank, count, world)
 
 
-def _merge(
-    whole: Started, source: Capture, out: Path, runs: list[Path], ledgers: list[Ledger]
-) -> None:
+def _together(ledgers: list[Ledger]) -> Ledger:
+    """What all blocks cost."""
+    steps = max(ledger.planned_steps for ledger in ledgers)
+    return Ledger(
+        planned_steps=steps,
+        parts=1,
+        device=ledgers[0].device,
+        steps=steps,
+        seconds=sum(ledger.seconds for ledger in ledgers),
+        peak_memory_mb=max(ledger.peak_memory_mb for ledger in ledgers),
+    )
+
+
+def _up_to_date(whole: Started, together: Ledger, out: Path, runs: list[Path]) -> bool:
+    """Whether the merged run was made of these blocks, as they are now."""
+    if read_ledger(out) != together:  # written last
+        return False
+    check_settings(read_started(out).settings(), whole.settings())
+    merged, *blocks = (file_of(run, "last").stat().st_mtime_ns for run in (out, *runs))
+    return all(block <= merged for block in blocks)
+
+
+def _merge(whole: Started, source: Capture, out: Path, runs: list[Path], together: Ledger) -> None:
     """Write the merged run: what all workers that get here write is the same."""
     models = [open_run(run, device="cpu").model for run in runs]
     merged: Any = merge(models, blocks_of(source, len(runs)))
-    steps = max(ledger.planned_steps for ledger in ledgers)
     write_started(out, whole)
-    progress = Progress(steps, steps, settings=whole.settings())
+    progress = Progress(together.steps, together.steps, settings=whole.settings())
     save_last(out, merged, adam(merged), progress)
-    write_ledger(
-        out,
-        Ledger(
-            steps,
-            1,
-            ledgers[0].device,
-            steps,
-            sum(ledger.seconds for ledger in ledgers),
-            max(ledger.peak_memory_mb for ledger in ledgers),
-        ),
-    )
+    write_ledger(out, together)
