@@ -9,6 +9,7 @@ import torch
 from sharpfield.captures import event_index
 from sharpfield.core import EventStream
 from sharpfield.formation.event_motion import EventMotion
+from sharpfield.formation.event_phase import OVERSHOOT
 from sharpfield.formation.ramps import RAMP_US, ramp_at, ramped_log_mean
 from sharpfield.formation.sharp_instants import Belief, SharpInstants
 from sharpfield.ops.event_index import EventIndex, build
@@ -33,31 +34,43 @@ def level(index: EventIndex, time_us: int) -> float:
     return float(whole + POSITIVE * parts[1] + NEGATIVE * parts[0])
 
 
-def test_light_is_continuous_and_steps_are_thresholds() -> None:
-    index = index_of((5_000, 1), (8_000, 1), (9_000, -1))
-    times = np.arange(0, 12_000, 10)
+TURNS = (5_000, 1), (8_000, 1), (9_000, -1)
+CORNERS = {
+    -2_000: 0.0, 5_000: 0.3, 8_000: 0.6, 8_000.001: 0.7, 9_000: 0.4, 9_000.001: 0.4 - 0.2 / 3
+}  # fmt: skip
+"""The light of these events: beyond the second and the third by a third of a threshold."""
+
+
+def light(times: np.ndarray) -> np.ndarray:
+    """Log light of `TURNS`."""
+    return np.interp(times, list(CORNERS), list(CORNERS.values()))
+
+
+def test_light_ramps_to_each_event_and_overshoots_where_it_turns() -> None:
+    index = index_of(*TURNS)
+    times = np.arange(5, 12_000, 10)
     levels = np.array([level(index, int(t)) for t in times])
-    assert np.abs(np.diff(levels)).max() < 0.01 * max(POSITIVE, NEGATIVE)
-    for time, wanted in ((5_000, 0.3), (8_000, 0.6), (9_000, 0.4), (11_990, 0.4)):
-        assert level(index, time) == pytest.approx(wanted, abs=1e-6)
+    assert levels == pytest.approx(light(times), abs=1e-6)
 
 
 def test_what_moves_slower_stood_still_before() -> None:
+    """A little beyond the last event, until the ramp to the next."""
     index = index_of((1_000, 1), (50_000, 1))
-    assert level(index, 50_000 - RAMP_US) == pytest.approx(POSITIVE)
-    assert level(index, 50_000 - RAMP_US // 2) == pytest.approx(1.5 * POSITIVE)
-    assert (ramp_at(index, 20_000, SIZE) == 0).all()
+    beyond = OVERSHOOT / 2
+    assert level(index, 20_000) == pytest.approx((1 + beyond) * POSITIVE)
+    assert level(index, 50_000 - RAMP_US) == pytest.approx((1 + beyond) * POSITIVE)
+    assert level(index, 50_000 - RAMP_US // 2) == pytest.approx((1.5 + beyond / 2) * POSITIVE)
+    assert (ramp_at(index, 0, SIZE)[0, 0] == 0).all()
 
 
 @pytest.mark.parametrize("window", [(0, 12_000), (4_000, 7_000), (8_500, 8_700), (20_000, 30_000)])
 def test_the_mean_is_that_of_many_instants(window: tuple[int, int]) -> None:
-    index = index_of((5_000, 1), (8_000, 1), (9_000, -1))
+    index = index_of(*TURNS)
     times = np.linspace(*window, 4001)[:-1] + (window[1] - window[0]) / 8000
-    exact = np.interp(times, [-1e4, -2_000, 5_000, 8_000, 9_000, 1e5], [0, 0, 0.3, 0.6, 0.4, 0.4])
-    wanted = math.log(np.exp(exact - level(index, window[0])).mean())
+    wanted = math.log(np.exp(light(times) - level(index, window[0])).mean())
     found = ramped_log_mean(index, window, (NEGATIVE, POSITIVE), SIZE)
     assert found[0, 0, 0] == 0
-    assert float(found[0, 1, 0]) == pytest.approx(wanted, abs=1e-5)
+    assert float(found[0, 1, 0]) == pytest.approx(wanted, abs=1e-4)
 
 
 def test_an_exposure_of_no_length_has_no_mean() -> None:

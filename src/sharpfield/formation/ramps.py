@@ -2,7 +2,8 @@
 
 A staircase rises when a threshold is already behind, so that all it says is late, by a millisecond
 or so: pictures made from it show where things were. Between two events a *ramp* lets the light
-move in the last part of the time before the second one.
+move in the last part of the time before the second one. Where light turns it has gone a little
+beyond its last event, see `formation.event_phase`.
 """
 
 import math
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from numba import njit
 from torch import Tensor
 
+from sharpfield.formation.event_phase import LONGEST_US, OVERSHOOT
 from sharpfield.ops.event_index import EventIndex, first_since
 
 RAMP_US = 7_000
@@ -21,7 +23,7 @@ RAMP_US = 7_000
 
 
 def ramp_at(index: EventIndex, time_us: int, size: tuple[int, int]) -> Float[Tensor, "h w 2"]:
-    """Parts of an event to darker (-1...0) and to brighter (0...1) on the way at a time.
+    """Parts of an event to darker (-1...0) and to brighter (0...1) since the last one.
 
     Args:
         index: Of a mono sensor whose events name pixels.
@@ -63,15 +65,30 @@ def _begin(t_us, first, event):
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _beyond(t_us, p, first, event, last):
+    """Signed height of the light beyond the event before this one, until the ramp, in events."""
+    if event == first:
+        return 0.0
+    height = OVERSHOOT * p[event - 1]
+    if event == last or p[event] != p[event - 1]:
+        return height
+    return 0.5 * height if t_us[event] - t_us[event - 1] > LONGEST_US else 0.0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def _ramps(offset, t_us, p, time_us, parts):
     for site in range(len(parts)):
-        event = first_since(t_us, offset[site], offset[site + 1], time_us + 1)
-        if event == offset[site + 1]:
-            continue
-        begin = _begin(t_us, offset[site], event)
-        if time_us > begin:
-            sign = 1 if p[event] > 0 else 0
-            parts[site, sign] = p[event] * (time_us - begin) / (t_us[event] - begin)
+        first, last = offset[site], offset[site + 1]
+        event = first_since(t_us, first, last, time_us + 1)
+        risen = 0.0
+        if event < last:
+            begin = _begin(t_us, first, event)
+            if time_us > begin:
+                risen = (time_us - begin) / (t_us[event] - begin)
+                parts[site, 1 if p[event] > 0 else 0] = risen * p[event]
+        beyond = _beyond(t_us, p, first, event, last)
+        parts[site, 1 if beyond > 0 else 0] += (1 - risen) * beyond
 
 
 @njit(cache=True, nogil=True)
@@ -100,6 +117,8 @@ def _log_means(offset, t_us, p, window_us, thresholds, mean):
         now, level, area, started = opens, 0.0, 0.0, False
         while now < closes:
             end, slope_from, step, ramp = closes, closes, 0.0, 1.0
+            beyond = _beyond(t_us, p, first, event, last)
+            beyond *= thresholds[1] if beyond > 0 else thresholds[0]
             if event < last:
                 slope_from = _begin(t_us, first, event)
                 step = thresholds[1] if p[event] > 0 else -thresholds[0]
@@ -107,9 +126,9 @@ def _log_means(offset, t_us, p, window_us, thresholds, mean):
                 end = min(closes, t_us[event])
             if not started:
                 # Relative to the opening, which may lie on a ramp.
-                level = -step * max(opens - slope_from, 0) / ramp
+                level = -beyond - (step - beyond) * max(opens - slope_from, 0) / ramp
                 started = True
-            area += _area(level, now, end, slope_from, step, ramp)
+            area += _area(level + beyond, now, end, slope_from, step - beyond, ramp)
             level += step
             now = end
             event += 1
