@@ -20,6 +20,7 @@ from tests.recordings.captured import (
     some_frames,
     some_recording,
 )
+from tests.recordings.test_evt import random_evt3
 from tests.streams import HEIGHT, WIDTH, random_events
 
 CONTAINERS = ["ros1", "sqlite3", "mcap"]
@@ -459,6 +460,43 @@ for container in CONTAINERS:
             most_per_byte=1.0,
         ),
     )
+
+
+def packed_events(encoding: str, compression: str) -> bytes:
+    """A bag of ROS 1 with packets, whose chunks are compressed."""
+    if encoding == "evt3":
+        payloads = [random_evt3(400)[i : i + 200] for i in range(0, 800, 200)]
+    else:
+        words = [(0x1000 | i, 0x2003, 0x3804, 0x4800, 0x5081) for i in range(20)]
+        payloads = [np.array(words, "<u2").tobytes()] * 4
+    with tempfile.TemporaryDirectory() as name:
+        ros, sent = Ros("ros1"), []
+        for i, payload in enumerate(payloads):
+            base_ns = 10**8 * i
+            message = ros.packet(encoding, payload, stamp_ns=i, base_ns=base_ns, size=(1280, 720))
+            sent.append(("/e", PACKET, message, i + 1))
+        return ros.write(Path(name), sent, compression=compression).read_bytes()
+
+
+# Packed, a byte of LZ4 stands for up to 255.
+PACKED = {"evt3": ("", 12.0), "libcaer_cmp": ("lz4", 1100.0)}
+for encoding, (compression, most) in PACKED.items():
+    fuzz.register(
+        f"rosbag-{encoding}",
+        fuzz.Case(
+            lambda encoding=encoding, compression=compression: packed_events(encoding, compression),
+            open_rosbag,
+            ".bag",
+            most_per_byte=most,
+        ),
+    )
+
+
+@pytest.mark.parametrize("encoding", PACKED)
+def test_damaged_packets(tmp_path: Path, encoding: str) -> None:
+    pytest.importorskip("rosbags")
+    outcomes = fuzz.campaign(f"rosbag-{encoding}", files=80, folder=tmp_path)
+    assert outcomes["refused"] and outcomes["partial"]
 
 
 @pytest.mark.parametrize("container", CONTAINERS)

@@ -1,3 +1,4 @@
+import tempfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.video import open_images, open_video
 from sharpfield.storage.images import write_image
+from tests.recordings import fuzz
 
 
 def pictures(folder: Path, count: int = 4) -> Path:
@@ -57,6 +59,19 @@ def test_a_torn_video_ends_early_or_is_refused(tmp_path):
             assert len(list(open_video(path).frames())) <= 30
         except CaptureError as error:
             assert str(path) in str(error)
+
+
+def short_video() -> bytes:
+    with tempfile.TemporaryDirectory() as name:
+        return video(Path(name) / "v.mkv", [40 * i for i in range(12)]).read_bytes()
+
+
+fuzz.register("video", fuzz.Case(short_video, open_video, ".mkv"))
+
+
+def test_damaged_videos(tmp_path):
+    outcomes = fuzz.campaign("video", files=60, folder=tmp_path)
+    assert outcomes["refused"]
 
 
 def test_the_sample_video(samples):

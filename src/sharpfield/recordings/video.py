@@ -110,7 +110,7 @@ def _decoded(path: Path, interval_us: float | None, trouble: Trouble) -> Iterato
     """Frames of a video, as far as it can be decoded."""
     count = 0
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), metadata_errors="replace") as container:
             if not container.streams.video:
                 raise CaptureError("the file holds no video", where=path)
             stream = container.streams.video[0]
