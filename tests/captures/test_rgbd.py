@@ -84,6 +84,32 @@ def test_frames_without_a_pose_are_dropped_and_named(tmp_path, poses, colours, d
     np.testing.assert_array_equal(usable_poses(poses[:, :3]).sum(), 9)
 
 
+def test_frames_without_depth_or_pose_files(tmp_path, poses, colours, depths):
+    exported(tmp_path, poses, colours, depths)
+    (tmp_path / "depth" / "0.png").unlink()
+    (tmp_path / "depth" / "4.png").unlink()
+    (tmp_path / "pose" / "6.txt").unlink()
+    (tmp_path / "color" / "Thumbs.db").write_bytes(b"x")
+    made = read(tmp_path)
+    assert made.notes["dropped"] == "1 of 12 frames have no usable pose: 6"
+    assert made.notes["without_depth"] == "2 of 12 frames have no depth: 0, 4"
+    kept = np.delete(np.arange(COUNT), 6)
+    depths[[0, 4]] = 0
+    np.testing.assert_array_equal(made.depth.stored, depths[kept])
+    for file in (tmp_path / "depth").glob("*.png"):
+        file.unlink()
+    assert read(tmp_path).depth is None
+
+
+def test_intrinsics_of_another_size_are_refused(tmp_path, poses, colours, depths):
+    exported(tmp_path, poses, colours, depths)
+    matrix = np.diag([1170.0, 1170.0, 1, 1])
+    matrix[:2, 2] = 648, 484
+    np.savetxt(tmp_path / "intrinsic" / "intrinsic_color.txt", matrix)
+    with pytest.raises(CaptureError, match="the intrinsics are not those of the images"):
+        read(tmp_path)
+
+
 def test_no_pose_at_all_is_an_error(tmp_path, poses, colours, depths):
     exported(tmp_path, np.full_like(poses, -np.inf), colours, depths)
     with pytest.raises(CaptureError, match="no frame has a usable pose"):
@@ -96,6 +122,18 @@ def test_large_colour_is_brought_to_the_published_size():
     np.testing.assert_allclose([camera.fx_px, camera.fy_px], [577.7778, 581.157], atol=1e-3)
     small = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)
     assert resized(small, (640, 480)) is small
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [((968, 1296), (480, 640)), ((1920, 1080), (640, 360)), ((1080, 1920), (360, 640))],
+)
+def test_large_colour_of_other_shapes_keeps_its_shape(size, expected):
+    width, height = size
+    camera = resized(Camera(width, height, 900.0, 900.0, width / 2, height / 2), (640, 480))
+    assert camera.size == expected
+    np.testing.assert_allclose(camera.fx_px / camera.fy_px, 1, atol=0.01)
+    np.testing.assert_allclose([camera.cx_px, camera.cy_px], np.array(expected) / 2)
 
 
 def with_depth(tiny: Capture) -> Capture:
@@ -221,6 +259,27 @@ def test_arkitscenes(tmp_path, poses, colours, depths):
     np.testing.assert_allclose(halfway, whole / 2, atol=1e-4)
     np.testing.assert_allclose(made.camera.fx_px, 53.55, atol=1e-9)
     np.testing.assert_allclose(made.notes["focal_spread"], 1.1 / 53.55, rtol=1e-6)
+
+
+def test_arkitscenes_with_depth_at_half_the_rate(tmp_path, poses, colours, depths):
+    lines = []
+    for i in range(COUNT):  # names are a millisecond off
+        inverse = np.linalg.inv(poses[i])
+        turn, _ = cv2.Rodrigues(inverse[:3, :3])
+        lines.append([100 + 0.016 * i, *turn[:, 0], *inverse[:3, 3]])
+        write_image(tmp_path / "lowres_wide" / f"1_{100 + 0.016 * i:.3f}.png", colours[i])
+        if i % 2:
+            name = f"1_{100.001 + 0.016 * i:.3f}"
+            map_ = depths[i].repeat(2, 0).repeat(2, 1)[..., None]
+            write_image(tmp_path / "lowres_depth" / f"{name}.png", map_)
+            (tmp_path / "lowres_wide_intrinsics").mkdir(exist_ok=True)
+            (tmp_path / "lowres_wide_intrinsics" / f"{name}.pincam").write_text("64 48 53 53 32 24")
+    np.savetxt(tmp_path / "lowres_wide.traj", lines)
+    made = read(tmp_path)
+    assert len(made.frames) == COUNT and "dropped" not in made.notes
+    assert made.notes["without_depth"].startswith("6 of 12 frames have no depth: 1_100.000, 1_100.")
+    assert not made.depth.stored[::2].any()
+    np.testing.assert_array_equal(made.depth.stored[1::2, ::2, ::2], depths[1::2])
 
 
 def test_many_images_are_mapped_and_found_again(tmp_path):

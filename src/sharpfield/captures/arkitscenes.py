@@ -5,10 +5,12 @@
     lowres_wide_intrinsics/VIDEO_TIME.pincam    `width height fx fy cx cy` of each frame
     lowres_wide.traj                            `time rx ry rz tx ty tz` in s, rad, m
 
-A line of the trajectory is camera from world: a turn about an axis, then a shift. It has ten poses
-a second and images sixty, so poses in between are interpolated, and images before the first or
-after the last are left out. The lens refocuses; a capture has one camera, so the median of all
-intrinsics stands for it, and `notes["focal_spread"]` says how far they stray.
+Names of the three may differ by a millisecond, and depth may have been taken less often: an image
+keeps the depth of the same time, or has none. A line of the trajectory is camera from world: a turn
+about an axis, then a shift. It has ten poses a second and images sixty, so poses in between are
+interpolated, and images before the first or after the last are left out. The lens refocuses; a
+capture has one camera, so the median of all intrinsics stands for it, and `notes["focal_spread"]`
+says how far they stray.
 
 Source: Baruch et al., *ARKitScenes* (NeurIPS 2021 datasets track), its data description.
 """
@@ -19,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Bool, Float64, Shaped
 
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.native_depth import decode_depth
@@ -34,6 +36,8 @@ from sharpfield.geometry.trajectory import Stamped
 WIDE, DEPTH, INTRINSICS = "lowres_wide", "lowres_depth", "lowres_wide_intrinsics"
 TRAJECTORY = "lowres_wide.traj"
 COLUMNS = 7
+SAME_S = 0.005
+"""Depth taken so shortly before or after an image is of the same time."""
 
 
 def recognise(folder: Path) -> bool:
@@ -53,19 +57,22 @@ def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb
         CaptureError: Something is missing, malformed, or does not fit together.
     """
     colour = sorted((folder / WIDE).glob("*.png"), key=_seconds)
-    colour = [path for path in colour if (folder / DEPTH / path.name).is_file()]
     if not colour:
+        raise CaptureError(f"there are no images in {WIDE}/", where=folder)
+    camera, spread = _camera(folder)
+    maps, measured = _depth_of(colour, list((folder / DEPTH).glob("*.png")))
+    if not measured.any():
         raise CaptureError(f"no image of {WIDE}/ has depth in {DEPTH}/", where=folder)
-    camera, spread = _camera(folder, colour)
-    maps = [folder / DEPTH / path.name for path in colour]
     frames = RgbdFrames(
         names=[path.stem for path in colour],
         poses=_poses(folder / TRAJECTORY, [_seconds(path) for path in colour]),
         colour=lambda row: rgb(colour[row]),
         depth=lambda row: decode_depth(maps[row]),
+        measured=measured,
         camera=camera,
         depth_camera=camera,
         sources=colour,
+        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
     )
     made = rgbd_capture(
         frames,
@@ -87,19 +94,32 @@ def _seconds(path: Path) -> float:
         ) from None
 
 
-def _camera(folder: Path, colour: Sequence[Path]) -> tuple[Camera, float]:
+def _depth_of(
+    colour: Sequence[Path], depth: Sequence[Path]
+) -> tuple[list[Path], Bool[np.ndarray, "n"]]:
+    """The depth map next in time to each image, and whether it is of the same time."""
+    if not depth:
+        return list(colour), np.zeros(len(colour), bool)
+    ordered = sorted(depth, key=_seconds)
+    times, asked = (np.array([_seconds(path) for path in paths]) for paths in (ordered, colour))
+    after = np.searchsorted(times, asked).clip(1, max(len(times) - 1, 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(times[after] - asked < asked - times[before], after, before)
+    return [ordered[i] for i in nearest], np.abs(times[nearest] - asked) < SAME_S
+
+
+def _camera(folder: Path) -> tuple[Camera, float]:
     """The camera of all frames, and how far the focal length strays, as a share."""
-    rows = [_pincam(folder / INTRINSICS / f"{path.stem}.pincam") for path in colour]
-    table = np.stack([row for row in rows if row is not None] or [np.zeros(6)])
+    rows = [_pincam(path) for path in sorted((folder / INTRINSICS).glob("*.pincam"))]
+    table = np.stack(rows or [np.zeros(6)])
     if not table[:, 2].all():
         raise CaptureError("no image has intrinsics", where=folder / INTRINSICS)
     width, height, fx, fy, cx, cy = np.median(table, axis=0).tolist()
     return Camera(int(width), int(height), fx, fy, cx, cy), float(np.ptp(table[:, 2]) / fx)
 
 
-def _pincam(path: Path) -> Shaped[np.ndarray, "6"] | None:
-    if not path.is_file():
-        return None
+def _pincam(path: Path) -> Shaped[np.ndarray, "6"]:
     row = read_matrix(path).ravel()
     if len(row) != 6:
         raise CaptureError("intrinsics must be six numbers", where=path, got=len(row))

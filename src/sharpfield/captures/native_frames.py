@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from sharpfield.captures.mapped_images import mapped_images
+from sharpfield.captures.mapped_images import mapped, mapped_images
 from sharpfield.captures.toml_tables import Table
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.storage.arrays import load_array
-from sharpfield.storage.images import describe, read_image, read_images, write_image
+from sharpfield.storage.images import describe, read_image, write_image
 
 FRAMES, TRUTH = "frames", "truth"
 GEOMETRY = {"depth": (), "flow": (2,)}
@@ -108,14 +108,17 @@ def _read_truth(
     known = np.array([table.yes("truth", False) for table in tables])
     if not known.any():
         return None, None
-    if known.all():
-        truth = mapped_images(paths, read_image, kind="truth")
-        _expect_like(truth, images, paths[0].parent)
-        return truth, known
-    truth = np.zeros(images.shape, images.dtype)
-    found = read_images([path for path, there in zip(paths, known, strict=True) if there])
-    _expect_like(found, images, paths[0].parent)
-    truth[known] = found
+    there = [path for path, one in zip(paths, known, strict=True) if one]
+    first = read_image(there[0])
+    _expect_like(first[None], images, paths[0].parent)
+    unknown = np.zeros_like(first)
+    truth = mapped(
+        list(zip(paths, known.tolist(), strict=True)),
+        lambda item: read_image(item[0]) if item[1] else unknown,
+        sources=there,
+        kind="truth",
+    )
+    _expect_like(truth, images, paths[0].parent)
     return truth, known
 
 

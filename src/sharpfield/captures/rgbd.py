@@ -23,7 +23,13 @@ from sharpfield.core.errors import CaptureError
 BOUNDS = (0.1, 8.0)
 """Nearest and farthest depth of rooms, in metres."""
 SIZE = (640, 480)
-"""Larger images are brought to this size."""
+"""Larger images are brought to this size; upright ones to the same, turned."""
+SAME_SHAPE = 0.02
+"""Images of about the same shape are brought to that size exactly, as published; others keep
+their own shape."""
+OFF_CENTRE = 0.25
+"""Intrinsics whose principal point is farther from the middle, over the size, are not the image's.
+"""
 FARTHEST_POSE = 30.0
 """Poses with a larger entry are failures of tracking, not places in a room."""
 NAMED = 6
@@ -44,11 +50,15 @@ class RgbdFrames:
     """Decodes the image of a frame."""
     depth: Callable[[Row], UInt16[np.ndarray, "y x"]] | None
     """Decodes the depth of a frame, in mm, 0 where unknown."""
+    measured: Bool[np.ndarray, "n"]
+    """Which frames have depth; where there is none, it is unknown everywhere."""
     camera: Camera
     """Of the colour images as stored."""
     depth_camera: Camera
     sources: Sequence[Path]
-    """The files all of it comes from."""
+    """The files that colour comes from."""
+    depth_sources: Sequence[Path]
+    """The files that depth comes from."""
 
 
 def rgbd_capture(
@@ -87,8 +97,8 @@ def rgbd_capture(
         kind=f"colour {camera.width}x{camera.height}",
     )
     depth = None
-    if frames.depth is not None:
-        maps = mapped(kept.tolist(), frames.depth, sources=frames.sources, kind="depth")
+    if frames.depth is not None and frames.measured[kept].any():
+        maps = _depth_maps(frames, frames.depth, kept.tolist())
         depth = DepthMaps(maps, frames.depth_camera, MILLIMETRE)
     photos = Photos(
         images=images,
@@ -104,7 +114,7 @@ def rgbd_capture(
         name=folder.resolve().name,
         source=source,
         points=points,
-        notes=_dropped(frames.names, usable),
+        notes=_notes(frames, usable),
     )
     return replace(made, depth=depth)
 
@@ -116,14 +126,18 @@ def usable_poses(poses: Float64[np.ndarray, "n 3 4"]) -> Bool[np.ndarray, "n"]:
 
 
 def resized(camera: Camera, most: tuple[int, int]) -> Camera:
-    """A camera whose images are brought to a size if they are larger; sides scale separately."""
-    if camera.width <= most[0] and camera.height <= most[1]:
+    """A camera whose images are brought to a size if they are larger, see `SAME_SHAPE`."""
+    wide, high = most if camera.width >= camera.height else most[::-1]
+    if camera.width <= wide and camera.height <= high:
         return camera
-    sx, sy = most[0] / camera.width, most[1] / camera.height
+    sx, sy = wide / camera.width, high / camera.height
+    if abs(sx / sy - 1) > SAME_SHAPE:
+        wide, high = (max(round(side * min(sx, sy)), 1) for side in camera.size)
+        sx, sy = wide / camera.width, high / camera.height
     return replace(
         camera,
-        width=most[0],
-        height=most[1],
+        width=wide,
+        height=high,
         fx_px=camera.fx_px * sx,
         fy_px=camera.fy_px * sy,
         cx_px=camera.cx_px * sx,
@@ -135,11 +149,20 @@ def pinhole(matrix: Shaped[np.ndarray, "r c"], size: tuple[int, int], *, where: 
     """A camera of an intrinsic matrix, 3x3 or larger, for pixel centres at +0.5.
 
     Raises:
-        CaptureError: It is no such matrix.
+        CaptureError: It is no such matrix, or one for images of another size.
     """
     if matrix.ndim != 2 or min(matrix.shape) < 3 or not np.isfinite(matrix[:3, :3]).all():
         raise CaptureError("cannot read the intrinsics", where=where, got=f"{matrix.shape} numbers")
     fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    off = max(abs(cx / size[0] - 0.5), abs(cy / size[1] - 0.5))
+    if off > OFF_CENTRE or not min(fx, fy) > 0:
+        raise CaptureError(
+            "the intrinsics are not those of the images",
+            where=where,
+            got=f"focal lengths {fx:.4g}, {fy:.4g}, principal point {cx:.4g}, {cy:.4g} px;"
+            f" images of {size[0]}x{size[1]}",
+            do="give intrinsics for images of this size, or the images that they are for",
+        )
     return Camera(*size, fx, fy, cx, cy)
 
 
@@ -177,9 +200,31 @@ def _sized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _dropped(names: Sequence[str], usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:
-    gone = np.flatnonzero(~usable).tolist()
-    if not gone:
-        return {}
-    named = ", ".join(names[i] for i in gone[:NAMED]) + (", ..." if len(gone) > NAMED else "")
-    return {"dropped": f"{len(gone)} of {len(usable)} frames have no usable pose: {named}"}
+def _depth_maps(
+    frames: RgbdFrames, decode: Callable[[Row], UInt16[np.ndarray, "y x"]], rows: list[Row]
+) -> UInt16[np.ndarray, "m y x"]:
+    unknown = np.zeros(frames.depth_camera.size[::-1], np.uint16)
+    return mapped(
+        rows,
+        lambda row: decode(row) if frames.measured[row] else unknown,
+        sources=frames.depth_sources,
+        kind="depth",
+    )
+
+
+def _notes(frames: RgbdFrames, usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:
+    """Which frames were left out, and which have no depth."""
+    notes: dict[str, float | str] = {}
+    if not usable.all():
+        notes["dropped"] = _named(frames, ~usable, "have no usable pose")
+    if frames.depth is not None and not frames.measured[usable].all():
+        notes["without_depth"] = _named(frames, usable & ~frames.measured, "have no depth")
+    return notes
+
+
+def _named(frames: RgbdFrames, which: Bool[np.ndarray, "n"], what: str) -> str:
+    rows = np.flatnonzero(which).tolist()
+    named = ", ".join(frames.names[i] for i in rows[:NAMED]) + (
+        ", ..." if len(rows) > NAMED else ""
+    )
+    return f"{len(rows)} of {len(which)} frames {what}: {named}"

@@ -2,7 +2,7 @@
 
     color/0.jpg, ...           RGB; `rgb/` and PNG are found, too
     depth/0.png, ...           16 bit, millimetres, 0 where unknown; of another size than colour
-    pose/0.txt, ...            4x4, world from camera; -inf where tracking failed
+    pose/0.txt, ...            4x4, world from camera; -inf, or no file, where tracking failed
     intrinsic/intrinsic_color.txt, intrinsic_depth.txt     4x4
     truth/0.png, truth/blur_px.txt    ours: sharp frames and true blur, where simulated
     SCENE_vh_clean.ply         optional, here or above: vertices of the reconstructed mesh
@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.mapped_images import mapped
 from sharpfield.captures.native_depth import decode_depth
 from sharpfield.captures.ply import columns, read_ply
 from sharpfield.captures.rgbd import (
@@ -33,6 +34,7 @@ from sharpfield.captures.rgbd import (
     rgbd_capture,
     usable_poses,
 )
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import SUFFIXES, read_image
@@ -74,24 +76,20 @@ def read(
     names = [path.stem for path in colour]
     first = read_image(colour[0])
     maps = [place / DEPTH / f"{name}.png" for name in names]
-    has_depth = (place / DEPTH).is_dir()
+    measured = np.array([path.is_file() for path in maps])
     camera = pinhole(
         read_matrix(place / INTRINSIC_COLOUR), first.shape[1::-1], where=place / INTRINSIC_COLOUR
     )
     frames = RgbdFrames(
         names=names,
-        poses=np.stack([read_pose(place / POSE / f"{name}.txt") for name in names]),
+        poses=np.stack([_pose(place / POSE / f"{name}.txt") for name in names]),
         colour=lambda row: rgb(colour[row]),
-        depth=(lambda row: decode_depth(maps[row])) if has_depth else None,
+        depth=lambda row: decode_depth(maps[row]),
+        measured=measured,
         camera=camera,
-        depth_camera=pinhole(
-            read_matrix(place / INTRINSIC_DEPTH),
-            decode_depth(maps[0]).shape[::-1],
-            where=place / INTRINSIC_DEPTH,
-        )
-        if has_depth
-        else camera,
+        depth_camera=_depth_camera(place, maps[int(np.argmax(measured))]) or camera,
         sources=colour,
+        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
     )
     made = rgbd_capture(
         frames,
@@ -138,6 +136,18 @@ def _colour(place: Path) -> list[Path]:
     return []
 
 
+def _pose(path: Path) -> Float64[np.ndarray, "3 4"]:
+    return read_pose(path) if path.is_file() else np.full((3, 4), np.nan)
+
+
+def _depth_camera(place: Path, path: Path) -> Camera | None:
+    """That of a depth map; None if the map is not there."""
+    if not path.is_file():
+        return None
+    matrix = read_matrix(place / INTRINSIC_DEPTH)
+    return pinhole(matrix, decode_depth(path).shape[::-1], where=place / INTRINSIC_DEPTH)
+
+
 def _mesh(folder: Path) -> Float64[np.ndarray, "m 3"] | None:
     for path in sorted(folder.glob("*_vh_clean.ply")):
         return columns(read_ply(path), ("x", "y", "z"), where=path).astype(np.float64)
@@ -150,8 +160,13 @@ def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> 
     paths = [place / TRUTH / f"{name}.png" for name in frames.names]
     known = np.array([path.is_file() for path in paths])
     if known.any():
-        truth = np.zeros(frames.images.shape, np.uint8)
-        truth[known] = [rgb(path) for path, there in zip(paths, known, strict=True) if there]
+        unknown = np.zeros(frames.images.shape[1:], np.uint8)
+        truth = mapped(
+            paths,
+            lambda path: rgb(path) if path.is_file() else unknown,
+            sources=[path for path in paths if path.is_file()],
+            kind="truth",
+        )
         frames = replace(frames, truth=truth, truth_known=known)
     if (place / TRUTH / BLUR).is_file():
         notes["blur_px"] = read_matrix(place / TRUTH / BLUR)[kept, 0]

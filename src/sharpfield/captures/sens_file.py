@@ -120,9 +120,11 @@ def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb
         poses=file.poses,
         colour=file.colour,
         depth=file.depth,
+        measured=file.lengths[:, 1] > 0,
         camera=pinhole(colour, file.colour_size, where=path),
         depth_camera=pinhole(depth, file.depth_size, where=path),
         sources=[path],
+        depth_sources=[path],
     )
     return rgbd_capture(
         frames,

@@ -56,14 +56,17 @@ def read(folder: Path, *, encoding: str = "srgb") -> Capture:
     poses = np.stack([read_pose(_beside(path, "pose.txt")) for path in colour])
     kept = [path for path, good in zip(colour, usable_poses(poses), strict=True) if good]
     several = colour[0].parent != folder
+    maps = [_beside(path, "depth.png") for path in colour]
     frames = RgbdFrames(
         names=[_name(path, several) for path in colour],
         poses=poses,
         colour=lambda row: rgb(colour[row]),
-        depth=lambda row: _depth(_beside(colour[row], "depth.png")),
+        depth=lambda row: _depth(maps[row]),
+        measured=np.array([path.is_file() for path in maps]),
         camera=camera,
         depth_camera=camera,
         sources=colour,
+        depth_sources=[path for path in maps if path.is_file()],
     )
     return rgbd_capture(
         frames,
