@@ -11,13 +11,14 @@ import torch
 
 from sharpfield.core import Camera, Capture, CaptureError, Growing, Model, OptionError, Rays
 from sharpfield.geometry import Still
+from sharpfield.geometry.rolling import Rolling
 from sharpfield.recipes import RECIPES, recipe_named
 from sharpfield.recipes.looks import LookOptions
 from sharpfield.recipes.splat_model import SplatModel
 from sharpfield.recipes.splat_scene import GaussianOptions
 from sharpfield.recipes.unknowns import UnknownOptions
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
-from sharpfield.simulation import EventSensor, Rig, Timing, simulate
+from sharpfield.simulation import EventSensor, FrameSensor, Rig, Timing, simulate
 from sharpfield.training import Options, adam, file_of, fit, train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
@@ -167,14 +168,68 @@ def test_scattered_rays_are_refused() -> None:
     )
 
 
-def test_a_distorted_lens_is_refused() -> None:
-    camera = recorded().camera
-    bent = Camera(32, 24, camera.fx_px, camera.fy_px, 16.0, 12.0, "fisheye", (0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(OptionError) as refused:
-        small("splat").build(replace(recorded(), camera=bent), 0)
-    assert "lenses without distortion" in str(refused.value)
-    assert "got    a fisheye lens" in str(refused.value)
-    assert "undistort frames and events first" in str(refused.value)
+LENSES = {
+    "brown": (-0.3, 0.08, 0.002, -0.002, 0.0),
+    "fisheye": (-0.02, 0.005, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_distorted_lens_is_learned_through(lens: str) -> None:
+    """All of the image is drawn, as recorded: no pixel is left without a view."""
+    rig = Rig((32, 24), lens=lens, distortion=LENSES[lens])
+    timing = Timing(frames=6, exposure_us=20_000, interval_us=24_000, test_every=4)
+    capture = simulate("tiles", rig=rig, timing=timing, seed=3)
+    model = small("ev-splat").build(capture, 0)
+    before, after = learned(model)
+    assert after < 0.8 * before
+    pose = model.capture.frame_pose(np.array([0]))[0]
+    seen = render_view(renderer_of(model), model.capture.camera, pose, 0.5)
+    assert seen.shape == (24, 32) and seen.opacity.min() > 0.05
+    other = model.through(replace(capture.camera, lens="pinhole", distortion=()))
+    straight = render_view(other, other.camera, pose, 0.5)
+    assert straight.shape == (24, 32) and (straight.rgb - seen.rgb).abs().mean() > 1e-3
+
+
+def test_a_lens_that_sees_too_wide_is_refused() -> None:
+    fish = Camera(32, 24, 9.0, 9.0, 16.0, 12.0, "fisheye", (0.0, 0.0, 0.0, 0.0))
+    model = small("splat").build(replace(recorded(), camera=fish), 0)
+    with pytest.raises(OptionError, match="sees too wide for pictures of Gaussians"):
+        model.losses(model.draw(0), 0)
+
+
+@functools.cache
+def rolled() -> Capture:
+    """A shaky camera that takes a tenth of a second to read an image."""
+    rig = Rig((36, 30), frame_sensor=FrameSensor(row_delay_us=3500.0))
+    timing = Timing(frames=9, exposure_us=10_000, interval_us=120_000, test_every=4)
+    return simulate("tiles", "shaky", rig=rig, timing=timing, seed=5)
+
+
+def test_a_rolling_shutter_is_better_modelled_than_not() -> None:
+    """Sharp pictures are more like views whose rows are read late than like those of an instant."""
+    model = replace(small("ev-splat"), steps=100).build(rolled(), 0)
+    fit(model, adam(model), steps=range(100))
+    frames = rolled().needed_frames
+    assert frames.truth is not None
+    shutter, off = Rolling.of(rolled(), along=model.path), []
+    for frame, sharp in enumerate(frames.truth):
+        time = model.capture.frame_time[frame].mean()
+        pose, late = (ask(time, torch.tensor(0)) for ask in (shutter.pose, shutter.rows))
+        seen = [
+            render_view(model, model.capture.camera, pose, float(time), rows=rows).rgb
+            for rows in (late, None)
+        ]
+        truth = torch.from_numpy(sharp / np.float32(frames.white))
+        off.append([(model.develop(light) - truth).square().mean() for light in seen])
+    modelled, ignored = torch.tensor(off).mean(0)
+    assert modelled < 0.98 * ignored
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_recipe_learns_through_a_rolling_shutter(name: str) -> None:
+    before, after = learned(small(name).build(rolled(), 0))
+    assert after < 0.9 * before
 
 
 @pytest.mark.parametrize(
