@@ -1,5 +1,7 @@
 """Voxels over space and time."""
 
+from dataclasses import replace
+
 import torch
 
 from sharpfield.core.rays import Rays
@@ -66,7 +68,7 @@ def test_rays_of_one_measurement_are_shifted_alike():
 
 
 def test_the_fast_march_is_the_plain_one():
-    """With gradients of the voxels alone, as in training; cells without values among them."""
+    """With gradients of voxels and times, as in training; cells without values among them."""
     where = [torch.rand(5, 6, 6, 6, generator=torch.Generator().manual_seed(5)) < 0.4]
     where.append(torch.ones(2, 4, 4, 4).bool())
     field, found = SpaceTimeVoxels(SIZE, where), {}
@@ -76,9 +78,10 @@ def test_the_fast_march_is_the_plain_one():
     for choice in ("reference", "auto"):
         field.zero_grad()
         with using(choice):
-            seen = ThroughBox(field, step=0.1)(rays())
+            when = rays().time.requires_grad_()
+            seen = ThroughBox(field, step=0.1)(replace(rays(), time=when))
         (seen.rgb.square().sum() + seen.depth.sum() + seen.opacity.sum()).backward()
-        found[choice] = [seen.rgb, seen.depth, *(p.grad for p in field.parameters())]
+        found[choice] = [seen.rgb, seen.depth, when.grad, *(p.grad for p in field.parameters())]
     for plain, fast in zip(found["reference"], found["auto"], strict=True):
         torch.testing.assert_close(fast, plain, atol=2e-4, rtol=1e-3)
 

@@ -156,3 +156,18 @@ def test_thresholds_are_learned_only_if_asked():
     windows = replace(SMALL.windows, learn_threshold=True)
     more = {g.name for g in replace(SMALL, windows=windows).build(capture, 0).groups()}
     assert more - names == {"thresholds"}
+
+
+def test_clocks_of_cameras_are_learned_only_if_asked():
+    capture = tiny_moving().without(frames=True)
+    seen = SMALL.build(capture, 0).draw(0)["windows"]
+    assert SMALL.build(capture, 0).on_time(seen) is seen
+    windows = replace(SMALL.windows, learn_late=True)
+    model = learned(replace(SMALL, windows=windows), capture, 4)
+    assert model.late is not None and model.late.abs().max() > 0, "a loss depends on it"
+    with torch.no_grad():
+        model.late.copy_(torch.tensor([0.1, 0.3, 0.2]))
+    shift = torch.tensor([0.1, -0.1, 0.0])[seen.track]
+    true = model.on_time(seen)
+    torch.testing.assert_close(true.start, seen.start + shift)
+    torch.testing.assert_close(true.end, seen.end + shift)

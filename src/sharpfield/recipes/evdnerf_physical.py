@@ -11,6 +11,7 @@ their counts do, up to a threshold.
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -65,6 +66,10 @@ class WindowOptions:
     """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
     learn_threshold: bool = False
     """Refine one threshold for each sign (with frames: events alone cannot tell their size)."""
+    learn_late: bool = False
+    """Learn by how much the clock of each camera is late against the mean of all."""
+    late_rate_us: float = 100.0
+    """First learning rate of that."""
     floor: float = 1e-5
     """Light added before the logarithm, where the capture does not note it."""
 
@@ -117,6 +122,9 @@ class Model(nn.Module):
         self.sensor = LogContrast(camera, path, FixedResponse(floor=self.floor))
         kind = LearnedThresholds if recipe.windows.learn_threshold else FixedThresholds
         self.thresholds = kind(*thresholds_of(capture, recipe.windows.threshold))
+        unknown = recipe.windows.learn_late
+        self.late = nn.Parameter(torch.zeros(index.tracks)) if unknown else None
+        """Of each track, in shares of the capture."""
         use_frames = capture.frames is not None and recipe.pixels > 0
         self.pixels = pixel_table(self.capture) if use_frames else None
         blurred = capture.frames is not None and not capture.frames.exposure.instant.all()
@@ -152,8 +160,9 @@ class Model(nn.Module):
         assert isinstance(spans := batch["spans"], EventPairs)
         assert isinstance(windows := batch["windows"], EventPairs)
         both = EventPairs.cat([spans, windows])
+        true = self.on_time(both)
         change = self.sensor.observe(
-            self.scene.sharp(self.sensor.expose(both), step, "events"), both
+            self.scene.sharp(self.sensor.expose(true), step, "events"), true
         )
         negative, positive = self.thresholds(both)
         measured, usual = both.measured(negative, positive), (negative + positive).detach() / 2
@@ -177,6 +186,13 @@ class Model(nn.Module):
             )
         return terms
 
+    def on_time(self, seen: EventPairs) -> EventPairs:
+        """Pairs at the times when things happened, instead of those on their cameras' clocks."""
+        if self.late is None:
+            return seen
+        late = (self.late - self.late.mean())[seen.track]
+        return replace(seen, start=seen.start - late, end=seen.end - late)
+
     def render(self, rays: Rays) -> Radiance:
         """Sharp linear light."""
         return self.scene.view(rays)
@@ -190,8 +206,13 @@ class Model(nn.Module):
         return (luma(light)[..., 0] + self.floor).log()
 
     def groups(self) -> list[Group]:
-        """Voxels and thresholds."""
+        """Voxels, thresholds and clocks."""
         groups = self.scene.groups(self.rate)
+        if self.late is not None:
+            rate = self.recipe.windows.late_rate_us / self.capture.clock.span_us
+            groups.append(
+                Group("late", (self.late,), exponential(rate, rate / 20, until=self.recipe.decay))
+            )
         if isinstance(self.thresholds, LearnedThresholds):
             own = tuple(self.thresholds.parameters())
             groups.append(

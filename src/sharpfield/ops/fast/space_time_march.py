@@ -30,7 +30,9 @@ def _(
 ) -> Float[Tensor, "b 5"]:
     rays = (origin, direction, time, place)
     grids = (*still, *moving)
-    if any(x.requires_grad for x in rays) or any(grid.dtype != torch.float32 for grid in grids):
+    if any(x.requires_grad for x in (origin, direction, place)) or any(
+        grid.dtype != torch.float32 for grid in grids
+    ):
         return march_through_time.reference(*rays, still, moving, rows)
     given = [x.contiguous() for x in rays]
     where = tuple(memory(x.contiguous()) for x in rows)
@@ -72,10 +74,14 @@ class _March(torch.autograd.Function):
             for k in range(PARTS)
         )
         wanted = memory(gradients[0].contiguous())
-        spread(_backward, _field(grids, ctx.where), rays, ctx.met, wanted, parts)
+        # Of no ray where nobody asks for the slope in time.
+        slopes = torch.zeros(len(time) if ctx.needs_input_grad[2] else 0)
+        lists = ctx.met, memory(slopes)
+        spread(_backward, _field(grids, ctx.where), rays, lists, wanted, parts)
         for total in sums:
             spread(_merge, total.reshape(PARTS, -1))
-        return None, None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
+        found = slopes if ctx.needs_input_grad[2] else None
+        return None, None, found, None, None, *[torch.from_numpy(total[0]) for total in sums]
 
 
 def _field(grids: Sequence[Tensor], where: tuple[np.ndarray, ...]) -> tuple[Any, ...]:
@@ -137,6 +143,26 @@ def _add_between(total, rows, first, later, corner, weight, slope):
 
 
 @kernel
+def _slope_between(values, rows, first, corner, weight, slope):
+    """How a loss grows with time at a located point, given how it does with what is found there."""
+    a, b, c, d = slope
+    grows = np.float32(0.0)
+    for t in range(2):
+        for k in range(2):
+            wz = weight[2] if k else np.float32(1.0) - weight[2]
+            for j in range(2):
+                wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
+                for i in range(2):
+                    row = rows[first + t, corner[2] + k, corner[1] + j, corner[0] + i]
+                    if row >= 0:
+                        w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
+                        cell = values[row]
+                        change = w * (a * cell[0] + b * cell[1] + c * cell[2] + d * cell[3])
+                        grows += change if t else -change
+    return grows * np.float32(0.5 * (len(rows) - 1))
+
+
+@kernel
 def _look_everywhere(field, x, y, z, time, scratch):
     """What all grids together hold at a point and a time; False outside."""
     found, corner, weight = scratch
@@ -155,11 +181,16 @@ def _look_everywhere(field, x, y, z, time, scratch):
 
 
 @kernel
-def _add_everywhere(field, x, y, z, time, scratch, slope, own):
-    """Add the gradient of what all grids hold at a point inside to that of their cells."""
+def _add_everywhere(field, point, time, scratch, slope, own, timed):
+    """Add the gradient of what all grids hold at a point inside to that of their cells.
+
+    Returns that of time, if it is `timed`.
+    """
     _, corner, weight = scratch
-    still, _, rows = field
+    still, moving, rows = field
+    x, y, z = point
     a, b, c, d = slope
+    grows = np.float32(0.0)
     for level in range(len(still)):
         locate(still[level], x, y, z, corner, weight)
         add(own[0][level], corner, weight, a, b, c, d)
@@ -167,6 +198,9 @@ def _add_everywhere(field, x, y, z, time, scratch, slope, own):
         first, later = _moment(rows[level], time)
         locate(rows[level][0], x, y, z, corner, weight)
         _add_between(own[1][level], rows[level], first, later, corner, weight, slope)
+        if timed:
+            grows += _slope_between(moving[level], rows[level], first, corner, weight, slope)
+    return grows
 
 
 @kernel
@@ -235,10 +269,11 @@ def _forward(worker, workers, field, rays, learning, met, out):
 
 
 @kernel
-def _backward(worker, workers, field, rays, met, wanted, parts):
-    """Gradients of the grids; part after part, each into its own sum."""
+def _backward(worker, workers, field, rays, lists, wanted, parts):
+    """Gradients of the grids; part after part, each into its own sum; those of times, if asked."""
     time, place = rays[2], rays[3]
-    traces, counts = met
+    (traces, counts), slopes = lists
+    timed = len(slopes) > 0
     scratch = _scratch()
     for part in range(worker, len(parts), workers):
         for ray in range(*share(part, len(parts), len(wanted))):
@@ -256,8 +291,10 @@ def _backward(worker, workers, field, rays, met, wanted, parts):
                     np.float32(row[2] * g[2] * row[6] * (1.0 - row[6])),
                 )
                 behind += row[2] * value
-                x, y, w = _point(rays, ray, z)
-                _add_everywhere(field, x, y, w, time[ray], scratch, slope, parts[part])
+                point = _point(rays, ray, z)
+                grows = _add_everywhere(field, point, time[ray], scratch, slope, parts[part], timed)
+                if timed and -1.0 <= time[ray] <= 1.0:
+                    slopes[ray] += grows
 
 
 @kernel
