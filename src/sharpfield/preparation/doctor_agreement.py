@@ -22,6 +22,8 @@ FARTHEST_US, COARSE_US, FINE_US = 60_000, 6_000, 1_000
 """Other times of the frames: how far, in which steps, and how finely around the best."""
 SHIFT_US, SHIFT_GAIN = 6_000, 0.03
 """A shift counts from this on, if the correlation gains so much."""
+LATENCY_US, CLEAR_GAIN = 10_000, 0.1
+"""Shorter ones that gain less may be the pixels: in dim light they report some ms late."""
 AGREES, BETTER = 0.4, 0.15
 """Correlation from which on two things agree; and what another arrangement must have on top."""
 POOR = 0.6
@@ -171,15 +173,7 @@ def _say(found: Agreement, checkup: Checkup) -> None:
             do="undo it when ingesting",
         )
     if shifted:
-        late = -found.shift_us / 1000
-        checkup.say(
-            "error",
-            "time-shift",
-            f"frame times are {abs(late):.0f} ms too {'late' if late > 0 else 'early'} for the"
-            " events",
-            got=f"{better} frames {abs(late):.0f} ms {'earlier' if late > 0 else 'later'}",
-            do=f"add {-late:+.0f} ms to the times of the frames, or ingest with that offset",
-        )
+        _say_shift(found, better, checkup)
     if found.best == AS_IS and not shifted:
         poor = found.correlation < POOR
         checkup.say(
@@ -189,6 +183,22 @@ def _say(found: Agreement, checkup: Checkup) -> None:
             got=got,
             do="check thresholds, noise and saturation" if poor else "",
         )
+
+
+def _say_shift(found: Agreement, better: str, checkup: Checkup) -> None:
+    gain = found.best_correlation - found.unshifted
+    small = abs(found.shift_us) <= LATENCY_US and gain < CLEAR_GAIN
+    late = -found.shift_us / 1000
+    do = f"ingest with --offset-ms {-late:g}, or what is given now and {-late:+g}"
+    if small:
+        do += "; less than the latency of the pixels is no mistake, and costs little"
+    checkup.say(
+        "warning" if small else "error",
+        "time-shift",
+        f"frame times are {abs(late):.0f} ms too {'late' if late > 0 else 'early'} for the events",
+        got=f"{better} frames {abs(late):.0f} ms {'earlier' if late > 0 else 'later'}",
+        do=do,
+    )
 
 
 def _luma_change(pair: ExposurePair) -> Float64[np.ndarray, "h w"]:

@@ -77,13 +77,23 @@ def match_pairs(
         if len(rows) < LEAST_MATCHES:
             continue
         xy = np.stack([one.xy[rows[:, 0]], two.xy[rows[:, 1]]], 1)
-        _, good = cv2.findFundamentalMat(
-            xy[:, 0], xy[:, 1], cv2.USAC_MAGSAC, TOLERANCE_PX, 0.999, 5000
-        )
+        good = _of_one_geometry(xy)
         if good is None or good.sum() < LEAST_MATCHES:
             continue
         found.append(PairMatches(pair, xy[good[:, 0] > 0]))
     return found
+
+
+def _of_one_geometry(xy: Float64[np.ndarray, "m 2 2"]) -> UInt8[np.ndarray, "m 1"] | None:
+    """Which matches the best geometry of two views explains; None if there is none."""
+    for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
+        try:
+            return cv2.findFundamentalMat(
+                xy[:, 0], xy[:, 1], method, TOLERANCE_PX, 0.999, 5000
+            )[1]  # fmt: skip
+        except cv2.error:  # an assertion of OpenCV 5 fails where a plane explains most
+            continue
+    return None
 
 
 def sampson_px(
