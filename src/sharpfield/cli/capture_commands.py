@@ -24,8 +24,10 @@ from sharpfield.simulation import (
     ROOM_RIG,
     SCENES,
     SENSORS,
+    DepthSensor,
     FrameSensor,
     Rig,
+    RoomSensors,
     RoomTiming,
     Timing,
     Views,
@@ -52,6 +54,16 @@ class Walked:
     """By the walk, or each picture by a random kernel, as published."""
     events: bool = False
     """Whether an event camera walks along; other scenes always have one."""
+    depth_noise: float = 0.0
+    """Standard deviation in metres of depth at one metre; it grows with the square of depth, and
+    there are holes at edges, at grazing angles and beyond 5 m. A Kinect's is 0.0014."""
+    drift: float = 0.0
+    """Metres by which poses stray slowly from the true ones."""
+
+    @property
+    def sensors(self) -> RoomSensors:
+        """How well depth and poses are known."""
+        return RoomSensors(DepthSensor(self.depth_noise), self.drift)
 
     def timing(self, timed: "Timed", layout: str) -> RoomTiming:
         """When frames are taken; a layout that fixes what is held out has its own split."""
@@ -193,7 +205,10 @@ def simulate(
         rig = recording.sensors(ROOM_RIG, parse_size(size or ROOM_SIZE))
         if layout == "scannet":  # whose photos are sRGB
             rig = replace(rig, frame_sensor=replace(rig.frame_sensor, encoding="srgb"))
-        made = simulate_room(rig=rig, timing=recording.walk.timing(timing, layout), seed=seed)
+        walk = recording.walk
+        made = simulate_room(
+            rig=rig, timing=walk.timing(timing, layout), sensors=walk.sensors, seed=seed
+        )
     elif scene in MOVING_SCENES:
         rig = recording.sensors(MOVING_RIG, parse_size(size or MOVING_SIZE))
         views, timed = around.cameras(recording, seed), timing.over(MOVING_TIMING)

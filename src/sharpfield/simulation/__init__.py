@@ -3,6 +3,7 @@
 from sharpfield.simulation.blur import Exposing, FrameSensor, decode, encode, store
 from sharpfield.simulation.bodies import Bodies
 from sharpfield.simulation.cameras import Carried, Standing, Views, hand_held, ring, ring_pose
+from sharpfield.simulation.depth_sensor import DepthSensor
 from sharpfield.simulation.event_sensor import SENSORS, EventSensor
 from sharpfield.simulation.events import EventPixels, watch
 from sharpfield.simulation.flow import depth_and_flow
@@ -25,11 +26,18 @@ from sharpfield.simulation.room import room
 from sharpfield.simulation.scenes import SCENES, Scene, scene
 from sharpfield.simulation.simulate import Rig, Timing, pictures, simulate, view
 from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
-from sharpfield.simulation.simulate_room import BLUR_NOTE, ROOM_RIG, RoomTiming, simulate_room
+from sharpfield.simulation.simulate_room import (
+    BLUR_NOTE,
+    ROOM_RIG,
+    RoomSensors,
+    RoomTiming,
+    simulate_room,
+)
 from sharpfield.simulation.travel import travel
 from sharpfield.simulation.walk import Walk, walk
 
 __all__ = [
+    "DepthSensor",
     "BLUR_NOTE",
     "MOTIONS",
     "MOVING_RIG",
@@ -50,6 +58,7 @@ __all__ = [
     "KernelRange",
     "Motion",
     "Rig",
+    "RoomSensors",
     "RoomTiming",
     "Scene",
     "Standing",

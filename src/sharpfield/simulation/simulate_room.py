@@ -14,7 +14,7 @@ from os import cpu_count
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt16
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Note, Split
@@ -25,6 +25,7 @@ from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
 from sharpfield.core.seed import numpy_generator
 from sharpfield.simulation.blur import Exposing, store
+from sharpfield.simulation.depth_sensor import DepthSensor, drifting
 from sharpfield.simulation.events import EventPixels, Gap, joined
 from sharpfield.simulation.motion import CameraPath, stamped
 from sharpfield.simulation.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
@@ -106,13 +107,23 @@ class RoomTiming:
         return self.frames * self.interval_us + 2 * MARGIN_US
 
 
-ROOM_RIG, ROOM_TIMING = Rig(size=(240, 180)), RoomTiming()
+@dataclass(frozen=True)
+class RoomSensors:
+    """What is known of the room besides its frames, and how well; exactly by default."""
+
+    depth: DepthSensor = DepthSensor()
+    drift: float = 0.0
+    """Metres by which the poses of the capture stray from the true ones, slowly."""
+
+
+ROOM_RIG, ROOM_TIMING, ROOM_SENSORS = Rig(size=(240, 180)), RoomTiming(), RoomSensors()
 
 
 def simulate_room(
     *,
     rig: Rig = ROOM_RIG,
     timing: RoomTiming = ROOM_TIMING,
+    sensors: RoomSensors = ROOM_SENSORS,
     kernels: KernelRange = PUBLISHED,
     seed: int = 0,
 ) -> Capture:
@@ -121,6 +132,7 @@ def simulate_room(
     Args:
         rig: Sensors and their numbers.
         timing: Frames, their blur, and which are held out.
+        sensors: How well depth and poses are known.
         kernels: What published blur is drawn from; its probability is `timing.blurry`.
         seed: Of the walk, the kernels and the noise.
 
@@ -139,22 +151,29 @@ def simulate_room(
     if timing.blur == "published":
         ranges = replace(kernels, probability=timing.blurry)
         frames, blur = _as_published(frames, timing.held_out, ranges, seed)
-    depth = np.stack(recorded.depth)
-    stored = np.where(depth < FARTHEST_M, depth / MILLIMETRE, 0)
+    stored = [
+        _stored(sensors.depth.measure(depth, camera, numpy_generator(seed, i, "depth noise")))
+        for i, depth in enumerate(recorded.depth)
+    ]
     return Capture(
         camera=camera,
-        trajectory=stamped(path, clock),
+        trajectory=stamped(drifting(path, sensors.drift, seed), clock),
         clock=clock,
         near=place.near,
         far=place.far,
         frames=frames,
         events=events,
         split=Split(np.flatnonzero(~timing.held_out), np.flatnonzero(timing.held_out)),
-        depth=DepthMaps(np.rint(stored).astype(np.uint16), camera),
+        depth=DepthMaps(np.stack(stored), camera),
         name=place.name,
         source="simulation",
         notes={BLUR_NOTE: blur, **recorded.notes()},
     )
+
+
+def _stored(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
+    """In millimetres; 0 where 16 bits cannot hold them."""
+    return np.rint(np.where(depth < FARTHEST_M, depth / MILLIMETRE, 0)).astype(np.uint16)
 
 
 class _Probe:
