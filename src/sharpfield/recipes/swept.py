@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 from torch.nn import functional
 
@@ -108,7 +108,7 @@ def silhouettes(
 
 def _levels(
     capture: Capture, index: EventIndex, track: int, instants: int
-) -> Int64[np.ndarray, "p t"]:
+) -> Int32[np.ndarray, "p t"]:
     """Log light of each pixel in mean thresholds, rounded, from the lowest of all on."""
     sites = index.sites_of(track)
     offset = index.offset[sites[0] : sites[-1] + 2]
@@ -117,9 +117,9 @@ def _levels(
     darker, brighter = thresholds_of(capture, None)
     step = np.where(polarity > 0, brighter, -darker) * (2 / (darker + brighter))
     first = np.ceil(np.clip(capture.clock.unit(t_us), 0, 1) * (instants - 1)).astype(np.int64)
-    change = np.zeros((len(sites), instants))
-    np.add.at(change, (site, first), step)
-    level = np.rint(change.cumsum(1)).astype(np.int64)
+    change = np.zeros((len(sites), instants), np.float32)
+    np.add.at(change, (site, first), step.astype(np.float32))
+    level = np.rint(change.cumsum(1)).astype(np.int32)
     return level - level.min()
 
 
