@@ -1,6 +1,7 @@
 """What a camera does not tell, found again: thresholds, poses and the clocks' offset.
 
-    python -m benchmarks.recovery [--minutes 6] [--size 160x104] [--out runs/recovery]
+    python -m benchmarks.recovery [--minutes 6 | --steps 4000] [--size 160x104]
+        [--thresholds 0.23 0.31] [--seed 0] [--only refined] [--out runs/recovery]
 
 A simulated camera has thresholds of 0.23 and 0.31; `ev-splat` starts from 0.25 for both, from poses
 that are off by 0.4 degrees and 1 % of the scene's depth (smoothly, as those of an encoder or of
@@ -36,9 +37,9 @@ WAVES = 5
 """The error of the poses has this many half waves along the recording, and fewer."""
 
 
-def recorded(size: tuple[int, int], seed: int) -> Capture:
-    """A capture with everything known, noise-free but for its thresholds."""
-    darker, brighter = THRESHOLDS
+def recorded(size: tuple[int, int], thresholds: tuple[float, float], seed: int) -> Capture:
+    """A capture with everything known, free of noise."""
+    darker, brighter = thresholds
     sensor = EventSensor(threshold_off=darker, threshold_on=brighter)
     timing = Timing(frames=26, exposure_us=50_000, interval_us=56_000)
     return simulate("garden", "shaky", rig=Rig(size, event_sensor=sensor), timing=timing, seed=seed)
@@ -91,13 +92,17 @@ def main() -> None:
     """Run, print and save."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=6.0)
+    parser.add_argument("--steps", type=int, help="instead of minutes")
+    parser.add_argument("--thresholds", type=float, nargs=2, default=THRESHOLDS)
     parser.add_argument("--size", default="160x104")
     parser.add_argument("--out", type=Path, default=Path("runs/recovery"))
     parser.add_argument("--only", nargs="*", default=["believed", "refined"])
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     console = Console()
-    truth = recorded(parse_size(asked.size), asked.seed)
+    thresholds = asked.thresholds[0], asked.thresholds[1]
+    options = Options(steps=asked.steps, minutes=None if asked.steps else asked.minutes)
+    truth = recorded(parse_size(asked.size), thresholds, asked.seed)
     capture = spoiled(truth, asked.seed + 1)
     native.write(truth, asked.out / "truth")
     native.write(capture, asked.out / "capture")
@@ -110,23 +115,26 @@ def main() -> None:
         )
         recipe = replace(recipe, unknowns=replace(recipe.unknowns, threshold=GUESS))
         started = Started("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
-        start(started, capture, run, Options(minutes=asked.minutes), device="cpu", console=console)
+        start(started, capture, run, options, device="cpu", console=console)
         opened = open_run(run, capture=None, device="cpu")
         metrics = measure(opened, run, console)
-        rows.append(_row(name, opened.model, metrics, truth))
+        rows.append({"poses": name, **_row(opened.model, metrics, truth, thresholds)})
     show(rows)
-    print(save("recovery", rows, {"minutes": str(asked.minutes), "size": asked.size}))
+    length = f"{asked.steps} steps" if asked.steps else f"{asked.minutes} minutes"
+    facts = {"length": length, "size": asked.size, "thresholds": str(thresholds)}
+    print(save("recovery", rows, facts | {"seed": str(asked.seed)}))
 
 
-def _row(name: str, model: Any, metrics: dict[str, Any], truth: Capture) -> dict[str, Any]:
+def _row(
+    model: Any, metrics: dict[str, Any], truth: Capture, thresholds: tuple[float, float]
+) -> dict[str, Any]:
     darker, brighter = model.unknowns.both_thresholds()
     degrees, percent = pose_error(model.capture, truth)
     return {
-        "poses": name,
         "darker": darker,
-        "off %": 100 * (darker / THRESHOLDS[0] - 1),
+        "off %": 100 * (darker / thresholds[0] - 1),
         "brighter": brighter,
-        "off % ": 100 * (brighter / THRESHOLDS[1] - 1),
+        "off % ": 100 * (brighter / thresholds[1] - 1),
         "late us": model.unknowns.offset_us,
         "pose deg": degrees,
         "pose % depth": percent,

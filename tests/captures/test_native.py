@@ -40,6 +40,13 @@ def test_a_capture_comes_back_exactly(tiny, tmp_path):
     assert differences(returned(tiny, tmp_path), tiny) == []
 
 
+def test_a_rolling_shutter_comes_back_exactly(tiny, tmp_path):
+    exposure = replace(tiny.frames.exposure, row_delay_us=0.75)
+    rolling = replace(tiny, frames=replace(tiny.frames, exposure=exposure))
+    assert differences(returned(rolling, tmp_path), rolling) == []
+    assert "row_delay_us = 0.75" in (tmp_path / "capture" / "capture.toml").read_text()
+
+
 def still(count):
     poses = np.tile(np.eye(3, 4), (count, 1, 1))
     poses[:, :, 3] = np.random.default_rng(0).normal(size=(count, 3))

@@ -98,6 +98,18 @@ def test_simulate_writes_the_published_layout(tmp_path: Path, recorded: Path) ->
     assert (out / "all_poses_bounds.npy").is_file()
 
 
+def test_simulate_has_lenses_and_rolling_shutters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--size", "16x12", "--frames", 3, "--rolling-shutter-ms", 22, "--lens", "fisheye")
+    shape = ("--distortion", -0.02, 0.01, 0, 0)
+    assert run("simulate", "--out", tmp_path / "fish", "--scene", "tiles", *words, *shape) == 0
+    about = (tmp_path / "fish" / "capture.toml").read_text()
+    assert "row_delay_us = 2000.0" in about and 'lens = "fisheye"' in about
+    assert run("simulate", "--out", tmp_path / "arm", "--scene", "arm", *words[-4:-2]) != 0
+    assert "scenes that stand still" in capsys.readouterr().err
+
+
 def test_deblur_writes_pictures(recorded: Path, tmp_path: Path) -> None:
     assert run("deblur", recorded, "--out", tmp_path / "sharp") == 0
     assert len(list((tmp_path / "sharp").glob("*.png"))) == 3 + 1  # and the contact sheet

@@ -35,3 +35,19 @@ def test_an_exposure_that_ends_before_it_begins():
         "  got    opens at 20 us, closes at 15 us\n"
         "  do     check the order of the two columns of exposure times"
     )
+
+
+def test_a_readout_lasts_from_the_first_row_to_the_last():
+    rolling = Exposure(us(0), us(10), row_delay_us=12.5)
+    assert rolling.readout_us(1) == 0 and rolling.readout_us(5) == 50
+    assert Exposure(us(0), us(10)).readout_us(100) == 0
+
+
+def test_rows_that_are_read_upwards():
+    with pytest.raises(CaptureError) as refused:
+        Exposure(us(0), us(10), row_delay_us=-1.0)
+    assert str(refused.value) == (
+        "CaptureError: rows of a rolling shutter must follow each other downwards\n"
+        "  got    a row delay of -1 us\n"
+        "  do     turn frames and events upside down"
+    )
