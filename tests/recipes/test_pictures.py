@@ -41,6 +41,15 @@ def test_without_events_they_are_the_frames(tiny):
     np.testing.assert_allclose(stored * 255, tiny.frames.images[tiny.split.train], atol=1e-2)
 
 
+def test_of_many_frames_a_few_are_taken_from_all_over(tiny):
+    train = tiny.split.train
+    few = sharp_pictures(tiny, THRESHOLDS, most=3)
+    whole = sharp_pictures(tiny, THRESHOLDS)
+    assert len(few) == 3 and len(whole) == len(train)
+    np.testing.assert_array_equal(few.light[[0, -1]], whole.light[[0, -1]])
+    np.testing.assert_array_equal(few.poses[[0, -1]], whole.poses[[0, -1]])
+
+
 def test_poses_are_those_in_the_middle_of_the_exposures(tiny):
     found = sharp_pictures(tiny, THRESHOLDS)
     np.testing.assert_allclose(found.poses, tiny.frame_pose(tiny.split.train), atol=1e-6)

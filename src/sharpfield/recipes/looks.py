@@ -23,8 +23,8 @@ from sharpfield.formation.event_counts import counts_between
 from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.event_phase import phase_at
 from sharpfield.formation.sharp_instants import Belief, SharpInstants
-from sharpfield.metrics.quality import quality_weights
 from sharpfield.ops.permutation import shuffled
+from sharpfield.recipes.judged import frame_weights
 from sharpfield.recipes.measured_depth import MeasuredDepth
 
 ROUNDED = 0.5
@@ -114,8 +114,7 @@ class Looks:
         if options.depth > 0 and capture.depth is not None:
             self.depth = MeasuredDepth(capture.depth, capture.camera)
         if options.quality != "even" and frames is not None:
-            weights = quality_weights(capture, source=options.quality)
-            self.weights = weights[capture.split.train]
+            self.weights = frame_weights(capture, options.quality)[capture.split.train]
 
     def instant(self, step: int, belief: Belief) -> Batch:
         """A single view of a sharp picture, anywhere between the first and the last exposure."""

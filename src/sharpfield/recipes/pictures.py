@@ -1,10 +1,12 @@
 """Sharp pictures of a scene, and where each was taken from: what a sparse cloud is made from."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
@@ -12,6 +14,9 @@ from sharpfield.formation.edi import latent
 from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
+
+MOST_PICTURES = 200
+"""Full precision takes 4 bytes a value: these are 0.7 GB at 640x480."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +66,34 @@ class Pictures:
         return self.light[view, y, x]
 
 
-def sharp_pictures(capture: Capture, thresholds: FixedThresholds) -> Pictures:
+def sharp_pictures(
+    capture: Capture, thresholds: FixedThresholds, *, most: int = MOST_PICTURES
+) -> Pictures:
     """The frames to learn from: deblurred to the middle of their exposure where events tell how.
 
     Args:
         capture: With frames, in the space that the pictures are to have.
         thresholds: Of the events, if there are any.
+        most: Of a long capture, so many frames spread over it.
 
     Raises:
         CaptureError: There are no frames, or events and frames differ in size.
     """
-    frames, chosen = capture.needed_frames, capture.split.train
+    frames, chosen = capture.needed_frames, spread(capture.split.train, most)
+    light = np.empty((len(chosen), *frames.images.shape[1:]), np.float32)
+    for view, picture in enumerate(sharp_light(capture, thresholds, chosen)):
+        light[view] = picture.numpy()
+    poses = capture.frame_pose(chosen).detach().double().numpy()
+    return Pictures(capture.camera, light, poses, capture.near, capture.far)
+
+
+def sharp_light(
+    capture: Capture, thresholds: FixedThresholds, chosen: Int64[np.ndarray, "m"]
+) -> Iterator[Float[Tensor, "h w c"]]:
+    """The linear light of some frames, one after the other, see `sharp_pictures`."""
+    frames = capture.needed_frames
     tone = tone_of(frames.encoding)
     motion = None if capture.events is None else EventMotion.of(capture)
-    light = []
     for i in chosen:
         stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
         picture = tone.decode(stored)
@@ -82,6 +101,11 @@ def sharp_pictures(capture: Capture, thresholds: FixedThresholds) -> Pictures:
             middle = frames.exposure.middle_us[i : i + 1]
             path = motion.path(frames.exposure.window(int(i)), middle, thresholds)
             picture = latent(picture, path, 0)
-        light.append(picture.clamp(0, 1).numpy())
-    poses = capture.frame_pose(chosen).detach().double().numpy()
-    return Pictures(capture.camera, np.stack(light), poses, capture.near, capture.far)
+        yield picture.clamp(0, 1)
+
+
+def spread(frames: Int64[np.ndarray, "n"], most: int) -> Int64[np.ndarray, "m"]:
+    """At most so many of some frames, evenly."""
+    if len(frames) <= most:
+        return frames
+    return frames[np.linspace(0, len(frames) - 1, most).round().astype(np.int64)]

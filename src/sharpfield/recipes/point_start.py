@@ -12,8 +12,9 @@ from sharpfield.captures.fused_points import fuse_points
 from sharpfield.captures.kept import kept
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import generator
+from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
-from sharpfield.recipes.pictures import Pictures
+from sharpfield.recipes.pictures import sharp_pictures
 from sharpfield.recipes.start_points import starting_points
 
 PAIRS = 1 << 20
@@ -220,14 +221,8 @@ def _guessed(
     options: CloudOptions, capture: Capture, seed: int
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n c"]]:
     """Pixels drawn by chance, as deep as a sparse cloud around them."""
-    frames, train = capture.needed_frames, capture.split.train
-    tone = tone_of(frames.encoding)
-    light = [
-        tone.decode(torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white).numpy()
-        for i in train
-    ]
-    poses = capture.frame_pose(train).detach().double().numpy()
-    pictures = Pictures(capture.camera, np.stack(light), poses, capture.near, capture.far)
+    tone = tone_of(capture.needed_frames.encoding)
+    pictures = sharp_pictures(capture.without(events=True), FixedThresholds(1.0, 1.0))
     count = options.budget or GUESSED
     made = generator(seed, 0, "cloud")
     start = starting_points(pictures, count, made, known=capture.points)

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, TypeVar
 
 import numpy as np
-import torch
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
@@ -17,7 +16,7 @@ from sharpfield.formation.threshold import FixedThresholds
 from sharpfield.formation.tone import tone_of
 from sharpfield.recipes.event_term import thresholds_of
 from sharpfield.recipes.looks import LookOptions
-from sharpfield.recipes.pictures import sharp_pictures
+from sharpfield.recipes.pictures import sharp_light
 from sharpfield.recipes.splat_model import SplatModel, with_row_clock
 from sharpfield.recipes.splat_scene import GaussianOptions
 from sharpfield.recipes.unknowns import UnknownOptions
@@ -182,10 +181,12 @@ def deblurred(capture: Capture, unknowns: UnknownOptions) -> Capture:
     frames = capture.needed_frames
     assert capture.needed_events is not None
     thresholds = FixedThresholds(*thresholds_of(capture, unknowns.threshold))
-    light = torch.from_numpy(sharp_pictures(with_row_clock(capture), thresholds).light)
-    stored = tone_of(frames.encoding).encode(light).numpy()
-    images = np.array(frames.images)
-    images[capture.split.train] = np.rint(stored * frames.white).astype(images.dtype)
+    images, train = np.array(frames.images), capture.split.train
+    tone = tone_of(frames.encoding)
+    for i, light in zip(
+        train, sharp_light(with_row_clock(capture), thresholds, train), strict=True
+    ):
+        images[i] = np.rint(tone.encode(light).numpy() * frames.white)
     middle = frames.exposure.middle_us
     exposure = replace(frames.exposure, open_us=middle, close_us=middle)
     sharp = replace(frames, images=images, exposure=exposure)
