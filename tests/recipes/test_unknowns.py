@@ -79,11 +79,12 @@ def test_groups_hold_all_of_them_once_at_their_rates(tiny: Capture):
     groups = {group.name: group for group in made.groups()}
     assert groups["unknowns"].rate(0) == 0.5 and groups["poses"].rate(0) == 0.25
     assert groups["offset"].rate(0) == 40.0 / OFFSET_UNIT_US
+    assert groups["thresholds"].rate(100) == 0.5 and len(groups["thresholds"].parameters) == 1
     assert groups["poses"].rate(100) == pytest.approx(0.25 / 20)
     listed = [id(p) for group in groups.values() for p in group.parameters]
     assert len(listed) == len(set(listed)) and set(listed) == {id(p) for p in made.parameters()}
     plain = {group.name for group in model(tiny, NONE).groups()}
-    assert plain.isdisjoint({"unknowns", "offset", "poses"})
+    assert plain.isdisjoint({"unknowns", "thresholds", "offset", "poses"})
 
 
 def test_a_late_clock_is_found_in_the_right_direction(tiny: Capture):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.schedule import Group, Schedule, exponential
+from sharpfield.core.schedule import Group, Schedule, constant, exponential
 from sharpfield.core.seed import generator
 from sharpfield.formation.response import FixedResponse, LogResidual, Response
 from sharpfield.formation.sharp_instants import Belief
@@ -48,7 +48,8 @@ class UnknownOptions:
     offset: bool = False
     """Learn by how much the events' clock is late against the frames' and poses'."""
     rate: float = 2e-3
-    """Learning rate of thresholds, response and gains (all logarithms)."""
+    """Learning rate of thresholds, response and gains (all logarithms); that of the thresholds of
+    the signs does not fall."""
     poses_rate: float = 3e-4
     """Of twists, in rad and units of the normalised scene."""
     offset_rate_us: float = 20.0
@@ -131,11 +132,17 @@ class Unknowns(nn.Module):
 
     def groups(self, steps: int) -> list[Group]:
         """Parameters with their rates, over a schedule of so many steps."""
-        options = self.options
+        options, own = self.options, self.thresholds
         offset = [] if self.offset_steps is None else [self.offset_steps]
-        others = [p for p in self.parameters() if all(p is not one for one in offset)]
-        found = [("unknowns", others, falling(options.rate, steps))]
-        found.append(("offset", offset, falling(options.offset_rate_us / OFFSET_UNIT_US, steps)))
+        # What these two numbers learn is as good as the scene, which is best at the end.
+        signs = [own.log_factor] if isinstance(own, LearnedThresholds) else []
+        alone = {id(p) for p in (*offset, *signs)}
+        others = [p for p in self.parameters() if id(p) not in alone]
+        found = [
+            ("unknowns", others, falling(options.rate, steps)),
+            ("thresholds", signs, constant(options.rate)),
+            ("offset", offset, falling(options.offset_rate_us / OFFSET_UNIT_US, steps)),
+        ]
         return [Group(name, tuple(own), rate) for name, own, rate in found if own]
 
 
