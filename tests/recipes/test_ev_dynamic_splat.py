@@ -72,25 +72,20 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
 
 
 def test_counts_are_those_of_the_camera():
-    """Where phases are unknown, counts are whole, and those of the right pixel and camera."""
+    """But for the parts of an event that light was on its way at either end."""
     capture = tiny_moving()
     model = small().build(capture, 0)
     seen = model.draw(STEPS - 1)["events"]
     events, clock = capture.needed_events, capture.clock
     assert events.track is not None
-    whole = 0
     for camera in range(2):
         first, last = (int(clock.us(float(t[camera, 0, 0, 0, 0]))) for t in (seen.start, seen.end))
         mine = (events.track == int(seen.track[camera, 0, 0, 0, 0])) & (events.p > 0)
         mine &= (events.t_us > first) & (events.t_us <= last)
         counts = np.zeros((16, 16))
         np.add.at(counts, (events.y[mine], events.x[mine]), 1)
-        blind = seen.slack[camera, 0, ..., 0] == 1.0  # neither phase is known
-        torch.testing.assert_close(
-            seen.positive[camera, 0, ..., 0][blind], torch.from_numpy(counts).float()[blind]
-        )
-        whole += int(counts[blind.numpy()].sum())
-    assert whole > 0
+        assert counts.max() > 2
+        assert np.abs(seen.positive[camera, 0, ..., 0].numpy() - counts).max() <= 1
 
 
 def test_what_stands_still_learns_alone_at_first():

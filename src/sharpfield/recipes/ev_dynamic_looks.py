@@ -44,6 +44,8 @@ class RigLookOptions:
     out altogether."""
     windows: float = 0.002
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
+    alone: float = 0.1
+    """The same weight where there are no frames."""
     shortest_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
     longest_us: int = 50_000
@@ -74,7 +76,7 @@ class RigLooks:
     def __init__(self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int) -> None:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
-        if frames is None and options.windows == 0:
+        if frames is None and options.alone == 0:
             raise CaptureError("nothing is left to learn from", where=capture.name)
         if frames is not None and not len(capture.split.train):
             raise CaptureError(

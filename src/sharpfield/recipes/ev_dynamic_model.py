@@ -74,7 +74,7 @@ class DynamicModel(nn.Module):
     def __init__(self, recipe: DynamicNumbers, capture: Capture, seed: int) -> None:
         super().__init__()
         self.recipe, self.seed = recipe, seed
-        moved, self.change = centred(_checked(capture))
+        moved, self.change = centred(capture)
         self.capture = with_learned_poses(moved, recipe.unknowns)
         self.path = self.capture.trajectory
         self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
@@ -114,6 +114,7 @@ class DynamicModel(nn.Module):
         light = self.scene.draw(Views(pose, time, look.weight, look.corner, look.size), step=step)
         terms = self.scene.terms()
         options, unknowns = self.recipe.looks, self.unknowns
+        windows = options.alone if self.capture.frames is None else options.windows
         if isinstance(frames, Pixels):
             exposed = replace(light, rgb=self._exposed(light.rgb, frames))
             terms["blur"] = (mix(exposed, outer=self.tone.encode) - frames.value).abs().mean()
@@ -123,10 +124,10 @@ class DynamicModel(nn.Module):
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(events, EventPairs):
             change = changes(light, events, unknowns.response)
-            terms["events"] = options.windows * count_error(change, events, unknowns.thresholds)
+            terms["events"] = windows * count_error(change, events, unknowns.thresholds)
             if unknowns.learns_thresholds:
                 off = threshold_error(change, events, unknowns.thresholds)
-                terms["thresholds"] = options.windows * off
+                terms["thresholds"] = windows * off
         if (prior := unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms
@@ -189,14 +190,3 @@ class OtherLens:
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
         return self.scene.draw(views, replace(self.scene.splatting, camera=self.camera))
-
-
-def _checked(capture: Capture) -> Capture:
-    if capture.camera.lens != "pinhole":
-        raise OptionError(
-            "splats are drawn for lenses without distortion",
-            where=capture.name,
-            got=f"a {capture.camera.lens} lens",
-            do="undistort frames and events first, or use a recipe that renders rays",
-        )
-    return capture
