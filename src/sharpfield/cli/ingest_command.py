@@ -25,12 +25,14 @@ from sharpfield.preparation.ingest import Ingested, Tell
 from sharpfield.preparation.ingest import ingest as ingest_recordings
 from sharpfield.preparation.ingest_choices import Choices, Cleaning, Crop, Scene, Timing
 from sharpfield.preparation.ingest_lens import Optics
+from sharpfield.preparation.ingest_mend import Mistakes, mended
 from sharpfield.recordings.open import FORMATS, Told, format_of, open_recording
 from sharpfield.recordings.recording import Recording
 
 FRAMES_ONLY = ("video", "pictures")
 """Formats that hold no events."""
 
+NO_MISTAKES = Mistakes()
 Size = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
 Start = Annotated[float | None, tyro.conf.arg(name="from", metavar="MS")]
 End = Annotated[float | None, tyro.conf.arg(name="to", metavar="MS")]
@@ -60,6 +62,8 @@ class Source:
     """Frames taken per second, where nothing says when they were, or the video is slow motion."""
     times: Path | None = None
     """The file that says when pictures were taken, where there are several."""
+    mistakes: Annotated[Mistakes, tyro.conf.arg(name="")] = NO_MISTAKES
+    """Of the file, to be undone."""
 
     def opened(self, path: Path) -> Recording:
         """A recording, told those of the options that its format knows."""
@@ -72,7 +76,9 @@ class Source:
                 if option in FORMATS[name].takes
             },
         )
-        return open_recording(path, told, layout=name)
+        if told.size is not None and self.mistakes.swap_xy:
+            told = replace(told, size=told.size[::-1])
+        return mended(open_recording(path, told, layout=name), self.mistakes)
 
     def expect_used(self, paths: tuple[Path, ...]) -> None:
         """Refuse options that none of the formats knows: they would have no effect.
@@ -167,7 +173,7 @@ def ingest(
     with _telling(console) as tell:
         made = ingest_recordings(opened, out, choices, tell)
     for line in _story(made, out):
-        console.print(line, highlight=False)
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _story(made: Ingested, out: Path) -> Iterator[str]:

@@ -54,6 +54,18 @@ class Arrangement:
         ]
         return " and ".join(part for part in parts if part)
 
+    @property
+    def flags(self) -> str:
+        """The options of `sharpfield ingest` that undo it."""
+        # `said` is read at the mirrored place after it was transposed, as `ingest` mends it
+        parts = [
+            "--swap-xy" * self.transposed,
+            "--flip-x" * self.mirrored_x,
+            "--flip-y" * self.mirrored_y,
+            "--flip-polarity" * self.flipped,
+        ]
+        return " ".join(part for part in parts if part)
+
     def score(
         self,
         seen: Float64[np.ndarray, "n h w"],
@@ -170,7 +182,7 @@ def _say(found: Agreement, checkup: Checkup) -> None:
             name,
             f"the events have {found.best.name}",
             got=f"{better} {found.best.name}",
-            do="undo it when ingesting",
+            do=f"ingest again with {found.best.flags}",
         )
     if shifted:
         _say_shift(found, better, checkup)

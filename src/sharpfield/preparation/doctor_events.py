@@ -40,7 +40,7 @@ def check_layout(capture: Capture, checkup: Checkup) -> bool:
     if swapped or (beyond and reach[0] < height and reach[1] < width):
         checkup.say(
             "error", "axes-swapped", "x and y of the events are exchanged", got=got,
-            do="exchange the two columns when ingesting",
+            do="ingest again with --swap-xy",
         )  # fmt: skip
         return False
     if beyond or (events.width, events.height) != (width, height):
