@@ -39,8 +39,8 @@ class EventMotion:
                 "deblurring needs the events of one camera",
                 where=capture.name,
                 got=f"events of {events.tracks} cameras",
-                do="train a recipe for rigs: evdnerf-physical, evdnerf, d-nerf; or leave the events"
-                " out (--use frames)",
+                do="train a recipe for rigs: ev-dynamic-splat, evdnerf-physical, evdnerf, d-nerf;"
+                " or leave the events out (--use frames)",
             )
         if (events.width, events.height) != camera.size:
             raise CaptureError(
