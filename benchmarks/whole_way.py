@@ -152,7 +152,9 @@ def digest(capture: Capture) -> str:
     return whole.hexdigest()[:12]
 
 
-def whole_way(folder: Path, size: tuple[int, int], frames: int, *, steps: Words, sfm: bool) -> list:
+def whole_way(
+    folder: Path, size: tuple[int, int], frames: int, *, steps: Words, sfm: bool
+) -> list[Row]:
     """A row for each container."""
     capture = recorded(size, frames)
     containers = written(capture, folder)
@@ -164,7 +166,7 @@ def whole_way(folder: Path, size: tuple[int, int], frames: int, *, steps: Words,
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="One recording in five containers.")
     parser.add_argument("--sfm", action="store_true", help="find the poses")
     parser.add_argument("--steps", type=int, default=30)
     told = parser.parse_args()
