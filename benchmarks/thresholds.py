@@ -3,8 +3,8 @@
     python -m benchmarks.thresholds [WORD]
 
 Sixteen captures that differ in scene, motion, sensor, thresholds, dead time, exposure and seed; the
-word picks those whose name contains it. The first six helped to make the method; the others, and
-these seeds, did not.
+word picks those whose name contains it. All settings were looked at
+while the method was made, with other seeds than these.
 """
 
 import sys
