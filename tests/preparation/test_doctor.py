@@ -15,6 +15,8 @@ from sharpfield.cli.doctor_command import doctor
 from sharpfield.core import Capture, Exposure, Split
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.doctor import examine, examine_path
+from sharpfield.preparation.doctor_events import check_light
+from sharpfield.preparation.doctor_findings import Checkup
 from sharpfield.preparation.event_health import odd_pixels
 from sharpfield.preparation.poses_path import frames_of
 from sharpfield.simulation import SENSORS, Rig, Timing, simulate
@@ -113,6 +115,16 @@ PLANTED: dict[str, tuple[Callable[[Capture], Capture], str, str]] = {
     "overexposed": (overexposed, "frames-saturated", "white"),
     "half the trajectory missing": (hole_in_path, "poses-missing", "hole"),
 }
+
+
+def test_objects_on_white_are_not_overexposed() -> None:
+    """As NeRF-synthetic's, whose background is white."""
+    white = overexposed(sound())
+    rendered = replace(white, notes=white.notes | {"background": "white"})
+    for capture, told in ((white, True), (rendered, False)):
+        checkup = Checkup("object")
+        check_light(capture, checkup)
+        assert any(found.check == "frames-saturated" for found in checkup.findings) is told
 
 
 def test_a_sound_capture_has_no_error_and_no_warning() -> None:
