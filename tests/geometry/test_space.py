@@ -131,6 +131,16 @@ def test_forward_facing(degrees: float, facing: bool):
     assert forward_facing(se3.exp(torch.from_numpy(twist)).numpy()) == facing
 
 
+def test_a_ring_has_no_mean_direction_but_an_average_camera():
+    """Directions cancel; the first camera's stand for them, and nothing divides by zero."""
+    quarter = np.radians([0, 90, 180, 270])
+    twist = np.zeros((4, 6))
+    twist[:, 1] = quarter
+    ring = se3.exp(torch.from_numpy(twist)).numpy()
+    assert not forward_facing(ring)
+    np.testing.assert_allclose(average_pose(ring), ring[0], atol=1e-12)
+
+
 def test_gradients():
     rays = ahead(3)
     inputs = rays.origin.requires_grad_(), rays.direction.requires_grad_()

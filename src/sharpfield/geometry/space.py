@@ -27,6 +27,9 @@ BOX_MARGIN = (0.01, 0.01, 0.0001)
 FORWARD_DEG = 60.0
 """Cameras that all look within this of their average direction make a forward-facing scene."""
 
+CANCELLED = 1e-6
+"""Length of a mean of directions below which it says nothing."""
+
 
 @dataclass(frozen=True)
 class Similarity:
@@ -52,9 +55,13 @@ class Similarity:
 
 
 def average_pose(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
-    """A camera at the mean position that looks along the mean direction."""
-    forward = _unit(poses[:, :, 2].sum(0))
-    right = _unit(np.cross(poses[:, :, 1].sum(0), forward))
+    """A camera at the mean position that looks along the mean direction.
+
+    Where directions cancel, as on a ring, that of the first camera stands for them.
+    """
+    forward = _mean_direction(poses[:, :, 2])
+    across = np.cross(_mean_direction(poses[:, :, 1]), forward)
+    right = _unit(across if np.linalg.norm(across) > CANCELLED else poses[0, :, 0])
     down = _unit(np.cross(forward, right))
     return np.stack([right, down, forward, poses[:, :, 3].mean(0)], 1)
 
@@ -74,7 +81,7 @@ def normalisation(poses: Float[np.ndarray, "n 3 4"], near: float) -> Similarity:
 
 def forward_facing(poses: Float[np.ndarray, "n 3 4"]) -> bool:
     """Whether all cameras look roughly the same way, so that NDC can hold the scene."""
-    forward = average_pose(poses)[:, 2]
+    forward = _mean_direction(poses[:, :, 2])
     return bool((poses[:, :, 2] @ forward > np.cos(np.radians(FORWARD_DEG))).all())
 
 
@@ -161,6 +168,11 @@ def _corner_rays(camera: Camera, poses: Float[Tensor, "n 3 4"]) -> tuple[Tensor,
     direction = camera.direction(xy)  # [4, 3]
     turned = torch.einsum("nij,kj->nki", poses[:, :, :3], direction)
     return poses[:, None, :, 3].expand_as(turned), turned
+
+
+def _mean_direction(directions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    mean = directions.mean(0)
+    return _unit(mean if np.linalg.norm(mean) > CANCELLED else directions[0])
 
 
 def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
