@@ -45,6 +45,7 @@ STAGES = {
     "fuse": ("sharpfield.recipes.point_start", "fuse_points"),
     "fit": ("sharpfield.training.train", "fit"),
     "step": ("sharpfield.training.fit", "accumulate"),
+    "grow": ("sharpfield.recipes.point_model", "missing_points"),
     "save": ("sharpfield.training.record", "save_last"),
     "load": ("sharpfield.training.train", "recover"),
 }
@@ -195,8 +196,6 @@ def measured(arguments: list[str], told: Path) -> tuple[Times, float, float]:
 
 def row(name: str, times: Times, own: float, whole: float, run: Path) -> Row:
     """A line of the table."""
-    begins = [begun for begun, _ in times["step"]]
-    gaps = [later - earlier for earlier, later in zip(begins, begins[1:], strict=False)]
     (fit, _), *_ = times["fit"]
     spent = {stage: sum(end - begun for begun, end in times[stage]) for stage in STAGES}
     known = spent["read"] + spent["judge"] + spent["fuse"] + spent["load"]
@@ -208,7 +207,8 @@ def row(name: str, times: Times, own: float, whole: float, run: Path) -> Row:
         "fuse s": spent["fuse"],
         "other start s": fit - known,
         "load s": spent["load"],
-        "step s": statistics.median(gaps) if gaps else None,
+        "step s": statistics.median(end - begun for begun, end in times["step"]),
+        "grow s": spent["grow"] / max(len(times["grow"]), 1),
         "save s": spent["save"] / max(len(times["save"]), 1),
         "saved GB": file.stat().st_size / 1e9,
         "GB": own,
@@ -263,7 +263,7 @@ def changes(recipe: str, points: int) -> list[str]:
         "cloud.budget=0",
         "growth.most=0",
         "growth.share=0.0001",
-        f"growth.every={1 / 3:.3f}",
+        "growth.every=0.5",
         "growth.until=1",
     ]
 
