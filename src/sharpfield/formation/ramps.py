@@ -16,7 +16,10 @@ from numba import njit
 from torch import Tensor
 
 from sharpfield.formation.event_phase import LONGEST_US, OVERSHOOT
-from sharpfield.ops.event_index import EventIndex, first_since
+from sharpfield.ops.event_index import (
+    EventIndex,
+    first_since,  # pyright: ignore[reportUnknownVariableType]
+)
 
 RAMP_US = 7_000
 """Longest ramp; what moves slower stood still before. 5 to 10 ms serve a hand-held camera best."""
