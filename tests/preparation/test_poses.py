@@ -101,6 +101,9 @@ def test_the_capture_survives_the_disk_and_the_report_says_what_happened(tmp_pat
     about = summary(unposed(fast()), found())
     assert json.loads(json.dumps(about))["registered"] == 21
     assert "21 of 21 pictures have a pose" in as_text(about)
+    assert not about["relief"]["flat"] and "nearly flat" not in as_text(about)
+    flat = about | {"relief": {"flat": True, "why": "it is nearly flat", "do": "look elsewhere"}}
+    assert "warning: it is nearly flat\n  do     look elsewhere" in as_text(flat)
 
 
 def test_known_positions_give_the_world() -> None:

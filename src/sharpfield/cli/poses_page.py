@@ -39,6 +39,7 @@ def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str
         part
         for part in (
             _header(about),
+            _flat(about),
             _failures(about),
             _pictures(original, found),
             section(
@@ -85,6 +86,14 @@ def _header(about: dict[str, Any]) -> str:
         f'<header>\n<p class="eyebrow">sharpfield poses</p>\n<h1>{html.escape(about["capture"])}'
         f'</h1>\n<p class="subtitle">From {told}</p>\n{page.cards(values)}</header>'
     )
+
+
+def _flat(about: dict[str, Any]) -> str:
+    relief = about["relief"]
+    if relief is None or not relief["flat"]:
+        return ""
+    rows = ((relief["why"], relief["do"]),)
+    return section("Too flat", as_html(Table(("what is unsure", "what to try"), rows)))
 
 
 def _failures(about: dict[str, Any]) -> str:

@@ -31,6 +31,7 @@ from sharpfield.preparation.poses_mapping import (
 )
 from sharpfield.preparation.poses_path import Laid, path_through
 from sharpfield.preparation.poses_pictures import Sharp, Source, sharp_pictures
+from sharpfield.preparation.poses_relief import Relief, relief
 from sharpfield.preparation.poses_space import Known, depths, known_world, measured_world, own_world
 
 INSTANTS, MOST_PICTURES = 3, 120
@@ -95,6 +96,8 @@ class PosesFound:
     kept: Int64[np.ndarray, "m"]
     """Which frames of the original capture are in the new one."""
     intrinsics: Intrinsics
+    relief: Relief | None
+    """How much depth the pictures show; None if they share too little to say."""
     off_known: float | None = None
     """Root mean square distance of camera centres from known ones."""
 
@@ -133,7 +136,7 @@ def find_poses(
     failures = tuple(
         Failure(int(i), *_why(int(i), sharp, seen)) for i in np.flatnonzero(~found.registered)
     )
-    return PosesFound(made, sharp, found, seen, failures, laid.kept, intrinsics, off)
+    return PosesFound(made, sharp, found, seen, failures, laid.kept, intrinsics, relief(found), off)
 
 
 def within(events: EventStream, path: Stamped | Still | Tracks, laid: Laid) -> EventStream:

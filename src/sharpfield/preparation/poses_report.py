@@ -6,6 +6,7 @@ import numpy as np
 
 from sharpfield.core.capture import Capture
 from sharpfield.preparation.poses_find import PosesFound
+from sharpfield.preparation.poses_relief import advice
 
 
 def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
@@ -50,6 +51,7 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
         },
         "bounds": {"near": _rounded(made.near, 4), "far": _rounded(made.far, 4)},
         "off_known_positions": found.off_known,
+        "relief": _relief(found),
         "each": _each(original, found),
     }
 
@@ -68,11 +70,28 @@ def as_text(about: dict[str, Any]) -> str:
     ]
     if about["off_known_positions"] is not None:
         lines.append(f"camera centres are {about['off_known_positions']:.4g} from the known ones")
+    if about["relief"] is not None and about["relief"]["flat"]:
+        lines.append(f"warning: {about['relief']['why']}")
+        lines.append(f"  do     {about['relief']['do']}")
     failed = [one for one in about["each"] if not one["registered"]]
     for one in failed:
         lines.append(f"no pose: {one['frame']} at {one['time_us']} us: {one['why']}")
         lines.append(f"  do     {one['do']}")
     return "\n".join(lines)
+
+
+def _relief(found: PosesFound) -> dict[str, Any] | None:
+    shown = found.relief
+    if shown is None:
+        return None
+    told = advice(shown, found.intrinsics)
+    return {
+        "flat": shown.flat,
+        "off_plane": _rounded(shown.off_plane, 4),
+        "tolerance_px": _rounded(shown.tolerance_px, 3),
+        "thickness": _rounded(shown.thickness, 4),
+        "pairs": shown.pairs,
+    } | ({} if told is None else {"why": told[0], "do": told[1]})
 
 
 def _each(original: Capture, found: PosesFound) -> list[dict[str, Any]]:
