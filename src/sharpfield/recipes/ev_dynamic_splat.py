@@ -1,6 +1,6 @@
 """Recipes on moving Gaussians: a moving scene from a rig of cameras, in minutes.
 
-What moves are Gaussians that follow a few nodes through time; what stands still are others. Frames,
+What moves are Gaussians that come, follow a parabola and go; what stands still are others. Frames,
 sharp or blurred, and events of any number of cameras say how: several cameras look at the same
 moments.
 """
@@ -17,20 +17,20 @@ from sharpfield.recipes.unknowns import UnknownOptions
 
 R = TypeVar("R", bound="DynamicSplat")
 
-HUANG = Paper(
-    key="huang2024scgs",
-    title="SC-GS: Sparse-Controlled Gaussian Splatting for Editable Dynamic Scenes",
-    bibtex="""@inproceedings{huang2024scgs,
-  title     = {{SC-GS}: Sparse-Controlled {Gaussian} Splatting for Editable Dynamic Scenes},
-  author    = {Huang, Yi-Hua and Sun, Yang-Tian and Yang, Ziyi and Lyu, Xiaoyang and
-               Cao, Yan-Pei and Qi, Xiaojuan},
+LI = Paper(
+    key="li2024spacetime",
+    title="Spacetime Gaussian Feature Splatting for Real-Time Dynamic View Synthesis",
+    bibtex="""@inproceedings{li2024spacetime,
+  title     = {Spacetime {Gaussian} Feature Splatting for Real-Time Dynamic View Synthesis},
+  author    = {Li, Zhan and Chen, Zhang and Li, Zhong and Xu, Yi},
   booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
   year      = {2024}
 }""",
     departures=(
-        "Nodes move on splines of their own, without a network, and stay where they start.",
+        "Gaussians have one colour each: there are no features that a network turns into colours.",
+        "Paths are parabolas instead of polynomials of degree three.",
         "What stands still are Gaussians of their own, before an even background.",
-        "Times are opened from the middle of the capture on.",
+        "Moving ones start in the hull of each moment, not at points of structure from motion.",
         "The loss is the mean absolute difference alone, without structural similarity.",
     ),
 )
@@ -40,7 +40,7 @@ OURS = Paper(
     title="Moving Gaussians from frames and events of many cameras (sharpfield)",
     bibtex="""@software{sharpfield,
   title = {sharpfield: sharp radiance fields from blurry frames and events},
-  note  = {Recipe ev-dynamic-splat. It builds on sparse-controlled Gaussians (Huang et al.,
+  note  = {Recipe ev-dynamic-splat. It builds on spacetime Gaussians (Li et al.,
            CVPR 2024), on the event double integral (Pan et al., CVPR 2019) and on EvDNeRF
            (Bhattacharya et al., WACV 2024)}
 }""",
@@ -51,7 +51,7 @@ OURS = Paper(
 class DynamicSplat:
     """Moving Gaussians from frames alone. What events must beat."""
 
-    paper: ClassVar[Paper] = HUANG
+    paper: ClassVar[Paper] = LI
 
     steps: int = 10_000
     """Length of the schedule."""
