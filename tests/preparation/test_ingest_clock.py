@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -5,6 +6,8 @@ from sharpfield.core import Exposure
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.preparation.ingest_clock import find_offset, shifted, triggered, with_length
 from sharpfield.recordings.recording import Triggers
+from sharpfield.simulation import EventSensor
+from sharpfield.simulation.events import EventPixels, joined
 
 SECONDS, FRAMES, INTERVAL_US = 6, 150, 33_333
 
@@ -37,6 +40,39 @@ def test_the_offset_is_found(lag_us, origin_us):
     assert found.certain, str(found)
     assert abs(found.offset_us + lag_us) <= max(found.within_us, 2000)
     assert found.within_us <= 10_000
+
+
+def shaken(seed: int, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A textured wall before a shaking camera: changes, middles of exposures, events in each ms."""
+    draw, gaps, shown = np.random.default_rng(seed), [], []
+    rough = draw.standard_normal((96, 96)).astype(np.float32)
+    wall = cv2.GaussianBlur(rough, (0, 0), 1.5) + 2 * cv2.GaussianBlur(rough, (0, 0), 4)
+    wall = 0.2 * np.exp(0.6 * wall / wall.std())
+    hz, phase = draw.uniform(0.7, 6, 8), draw.uniform(0, 2 * np.pi, (2, 8))
+    times_us = np.arange(0, 40 * INTERVAL_US + 30_000, 2000)
+    pixels = EventPixels(EventSensor(threshold_on=threshold, threshold_off=threshold), seed)
+    for t_us in times_us:
+        x, y = (5 / hz**0.9 * np.sin(2e-6 * np.pi * hz * t_us + phase)).sum(-1)
+        moved = np.array([[1, 0, 24 + x], [0, 1, 32 + y]], np.float32)
+        seen = cv2.warpAffine(wall, moved, (48, 32), flags=cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR)
+        shown.append(np.clip(seen, 0, 1))
+        gaps.append(pixels.see(shown[-1], 1000 * int(t_us)))
+    opens_us = 10_000 + 2000 * (np.arange(40, dtype=np.int64) * INTERVAL_US // 2000)
+    light = [np.mean(shown[i : i + 6], 0) for i in opens_us // 2000]
+    change = np.abs(np.diff(np.log(np.maximum(light, 1 / 255)), axis=0)).mean((1, 2))
+    return change, opens_us + 5000, np.bincount(joined(gaps, (48, 32)).t_us // 1000)
+
+
+def test_the_search_itself_is_not_late_but_events_of_high_thresholds_are():
+    off_us = []
+    for seed in (0, 1, 3):
+        (change, middles_us, fine), (_, _, coarse) = (shaken(seed, c) for c in (0.05, 0.4))
+        same, late = (find_offset(change, middles_us, events, 0) for events in (fine, coarse))
+        planted = find_offset(change, middles_us - 50_000, fine, 0)
+        assert abs(same.offset_us) <= 2000 and abs(planted.offset_us - 50_000) <= 2000
+        off_us.append((same.offset_us, late.offset_us))
+    fine_us, coarse_us = np.mean(off_us, 0)
+    assert abs(fine_us) < 1000 and 1000 < coarse_us < 8000
 
 
 def test_the_best_offset_is_that_of_a_slow_search():
