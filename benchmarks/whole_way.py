@@ -117,25 +117,37 @@ def command(*words: object) -> None:
 def gone(name: str, told: Words, folder: Path, *, poses: Words, steps: Words) -> Row:
     """All the way of one container."""
     began, place = time.perf_counter(), folder / name.replace(" ", "-")
-    lens = ("--encoding", "gamma2.2")
-    command("ingest", *told, "--out", place / "cap", *lens)
-    command("doctor", place / "cap", "--out", place / "doctor")
+    row = {"container": name, **taken_in(told, place, poses=poses), "errors": errors(place)}
+    row["psnr"] = learned(place, steps=steps)
+    return row | {"s": round(time.perf_counter() - began, 1)}
+
+
+def taken_in(told: Words, place: Path, *, poses: Words) -> Row:
+    """From a container to a capture with poses."""
+    command("ingest", *told, "--out", place / "cap", "--encoding", "gamma2.2")
     command("poses", place / "cap", "--out", place / "posed", *poses)
-    run = ("--out", place / "run", "--hold-out", "every:4", *steps)
-    command("train", "ev-splat", place / "posed", *run)
-    command("evaluate", place / "run")
     capture = native.read(place / "posed")
-    checkup: dict[str, Any] = json.loads((place / "doctor" / "doctor.json").read_text())
-    metrics = json.loads((place / "run" / "metrics.json").read_text())
     return {
-        "container": name,
         "events": len(capture.needed_events),
         "frames": len(capture.needed_frames),
         "digest": digest(capture),
-        "errors": checkup["counts"]["error"],
-        "psnr": round(metrics["mean"]["psnr"], 6),
-        "s": round(time.perf_counter() - began, 1),
     }
+
+
+def errors(place: Path) -> int:
+    """How many the doctor finds in a capture before it has poses."""
+    command("doctor", place / "cap", "--out", place / "doctor")
+    checkup: dict[str, Any] = json.loads((place / "doctor" / "doctor.json").read_text())
+    return checkup["counts"]["error"]
+
+
+def learned(place: Path, *, steps: Words) -> float:
+    """From a capture with poses to a score, the mean PSNR of held-out views."""
+    run = ("--out", place / "run", "--hold-out", "every:4", *steps)
+    command("train", "ev-splat", place / "posed", *run)
+    command("evaluate", place / "run")
+    metrics = json.loads((place / "run" / "metrics.json").read_text())
+    return round(metrics["mean"]["psnr"], 6)
 
 
 def digest(capture: Capture) -> str:
