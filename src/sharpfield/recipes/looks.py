@@ -241,7 +241,7 @@ class Looks:
     def _frame_pixels(self, frame: int, part: Part) -> Pixels:
         """The blurred frame `[1, h, w]`."""
         frames = self.capture.needed_frames
-        image = part.of(torch.from_numpy(np.asarray(frames.images[frame])))
+        image = part.of(torch.from_numpy(np.array(frames.images[frame])))
         opens, closes = self.capture.frame_time[frame]
         return self._pixels(
             (image.to(torch.float32) / frames.white)[None], frame, (opens, closes), part

@@ -52,7 +52,7 @@ class UnknownOptions:
     the signs does not fall."""
     poses_rate: float = 3e-4
     """Of twists, in rad and units of the normalised scene."""
-    offset_rate_us: float = 20.0
+    offset_rate_us: float = 60.0
     """Of the offset, in us a step."""
 
 
