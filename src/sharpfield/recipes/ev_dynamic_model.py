@@ -32,7 +32,7 @@ from sharpfield.recipes.unknowns import (
     pose_groups,
     with_learned_poses,
 )
-from sharpfield.recipes.window_terms import changes, count_error, threshold_error
+from sharpfield.recipes.window_terms import event_terms
 
 Terms = dict[str, Tensor]
 
@@ -123,11 +123,7 @@ class DynamicModel(nn.Module):
             stored = self.tone.encode(light.rgb)
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(events, EventPairs):
-            change = changes(light, events, unknowns.response)
-            terms["events"] = windows * count_error(change, events, unknowns.thresholds)
-            if unknowns.learns_thresholds:
-                off = threshold_error(change, events, unknowns.thresholds)
-                terms["thresholds"] = windows * off
+            terms |= event_terms(light, events, unknowns, windows)
         if (prior := unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms

@@ -19,7 +19,7 @@ from sharpfield.formation.tone import Tone
 from sharpfield.ops.event_index import EventIndex
 from sharpfield.recipes.ev_dynamic_start import moving_start, still_start, usual_colour
 from sharpfield.recipes.markov_growth import idleness, share_out, wander
-from sharpfield.recipes.splat_scene import SHEEN_SLOWER, Rates
+from sharpfield.recipes.splat_scene import Rates, gaussian_groups
 from sharpfield.rendering.splat import Splatting
 
 Terms = dict[str, Tensor]
@@ -164,15 +164,10 @@ class DynamicScene(nn.Module):
         """Parameters with their rates."""
         groups, later, rates = [], self._later, self.options.rates
         for name, own, when in (("still", self.still, _always), ("moving", self.moving, later)):
-            named = {
-                "means": (own.means, self.means_rate),
-                "quaternions": (own.quaternions, constant(rates.quaternions)),
-                "scales": (own.log_scales, constant(rates.log_scales)),
-                "opacities": (own.opacity_logits, constant(rates.opacities)),
-                "colours": (own.base_harmonics, constant(rates.colours)),
-                "sheen": (own.higher_harmonics, constant(rates.colours / SHEEN_SLOWER)),
-            }
-            groups += [Group(f"{name} {of}", (p,), when(rate)) for of, (p, rate) in named.items()]
+            groups += [
+                Group(f"{name} {group.name}", group.parameters, when(group.rate))
+                for group in gaussian_groups(own, rates, self.means_rate)
+            ]
         own, pace = self.moving, SLOWER / self.span
         paths = {
             "velocities": (own.velocities, scaled(self.means_rate, pace)),

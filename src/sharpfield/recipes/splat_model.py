@@ -41,7 +41,7 @@ from sharpfield.recipes.unknowns import (
     with_learned_poses,
     with_learned_shake,
 )
-from sharpfield.recipes.window_terms import changes, count_error, threshold_error
+from sharpfield.recipes.window_terms import event_terms
 
 Terms = dict[str, Tensor]
 
@@ -162,14 +162,7 @@ class SplatModel(nn.Module):
             drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
             terms["depth"] = self.options.depth * depth_error(drawn, depth.value)
         if isinstance(events, EventPairs):
-            unknowns = self.unknowns
-            change = changes(light, events, unknowns.response)
-            terms["events"] = self.options.windows * count_error(
-                change, events, unknowns.thresholds
-            )
-            if unknowns.learns_thresholds:
-                off = threshold_error(change, events, unknowns.thresholds)
-                terms["thresholds"] = self.options.windows * off
+            terms |= event_terms(light, events, self.unknowns, self.options.windows)
         if (prior := self.unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms

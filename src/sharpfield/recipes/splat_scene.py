@@ -11,7 +11,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.growth import Growth
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
-from sharpfield.core.schedule import Group, constant, exponential
+from sharpfield.core.schedule import Group, Schedule, constant, exponential
 from sharpfield.core.seed import generator
 from sharpfield.core.views import Views
 from sharpfield.fields import Gaussians
@@ -141,16 +141,7 @@ class SplatScene(nn.Module):
 
     def groups(self) -> list[Group]:
         """Parameters with their rates."""
-        own, rates = self.gaussians, self.options.rates
-        named = {
-            "means": (own.means, self.means_rate),
-            "quaternions": (own.quaternions, constant(rates.quaternions)),
-            "scales": (own.log_scales, constant(rates.log_scales)),
-            "opacities": (own.opacity_logits, constant(rates.opacities)),
-            "colours": (own.base_harmonics, constant(rates.colours)),
-            "sheen": (own.higher_harmonics, constant(rates.colours / SHEEN_SLOWER)),
-        }
-        return [Group(name, (parameter,), rate) for name, (parameter, rate) in named.items()]
+        return gaussian_groups(self.gaussians, self.options.rates, self.means_rate)
 
     def _share_out(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         own, options = self.gaussians, self.options
@@ -187,3 +178,16 @@ def budget_of(options: GaussianOptions, capture: Capture) -> int:
     """Most Gaussians there may be."""
     width, height = capture.camera.size
     return options.budget or max(round(width * height * options.density), LEAST)
+
+
+def gaussian_groups(own: Gaussians, rates: Rates, means_rate: Schedule) -> list[Group]:
+    """Parameters of Gaussians with their rates; means have a schedule, the rest keep theirs."""
+    named = {
+        "means": (own.means, means_rate),
+        "quaternions": (own.quaternions, constant(rates.quaternions)),
+        "scales": (own.log_scales, constant(rates.log_scales)),
+        "opacities": (own.opacity_logits, constant(rates.opacities)),
+        "colours": (own.base_harmonics, constant(rates.colours)),
+        "sheen": (own.higher_harmonics, constant(rates.colours / SHEEN_SLOWER)),
+    }
+    return [Group(name, (parameter,), rate) for name, (parameter, rate) in named.items()]

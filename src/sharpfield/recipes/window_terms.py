@@ -14,12 +14,24 @@ from sharpfield.core.measurements import EventPairs
 from sharpfield.core.radiance import Radiance
 from sharpfield.formation.response import Response
 from sharpfield.formation.threshold import Thresholds
+from sharpfield.recipes.unknowns import Unknowns
 
 BLOCK = 8
 """Side of a block of pixels, far larger than what is soft or misplaced."""
 
 TINY = 1e-12
 """Mean square change of log light of a scene that does not move."""
+
+
+def event_terms(
+    light: Radiance, events: EventPairs, unknowns: Unknowns, weight: float
+) -> dict[str, Tensor]:
+    """What the windows of a look add to the loss, for the scene and for learned thresholds."""
+    change = changes(light, events, unknowns.response)
+    terms = {"events": weight * count_error(change, events, unknowns.thresholds)}
+    if unknowns.learns_thresholds:
+        terms["thresholds"] = weight * threshold_error(change, events, unknowns.thresholds)
+    return terms
 
 
 def changes(light: Radiance, events: EventPairs, response: Response) -> Float[Tensor, "m q h w c"]:
