@@ -12,13 +12,11 @@ Source: DVGO (CVPR 2022) for voxels and activations, with time as a fourth axis.
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float, Int32
 from torch import Tensor
 
 from sharpfield.ops._dispatch import Op
-from sharpfield.ops.composite import gather, weights_of_opacities
-from sharpfield.ops.voxel_march import THIN
+from sharpfield.ops.voxel_march import light_of, trilinear
 
 
 @Op
@@ -43,18 +41,12 @@ def march_through_time(
         rows: Of moving cells, by time, z, y and x; at least two moments.
     """
     points = origin[:, None] + place[..., None] * direction[:, None]
-    inside = (points.abs() <= 1).all(-1)
-    found = [_trilinear(grid, points) for grid in still]
+    found = [trilinear(grid, points) for grid in still]
     found += [
         _through_time(spread_out(values, at), points, time)
         for values, at in zip(moving, rows, strict=True)
     ]
-    raw = torch.stack(found).sum(0)  # [b, s, 4]
-    alpha = (1 - torch.exp(-F.softplus(raw[..., 0] + THIN))) * inside
-    weights = weights_of_opacities(alpha)
-    depth = (weights * place).sum(-1, keepdim=True)
-    seen = gather(weights, torch.sigmoid(raw[..., 1:]))
-    return torch.cat([seen, depth, weights.sum(-1, keepdim=True)], -1)
+    return light_of(torch.stack(found).sum(0), points, place, opaque_end=False)
 
 
 def spread_out(
@@ -68,16 +60,10 @@ def _through_time(grid: Tensor, points: Tensor, time: Tensor) -> Float[Tensor, "
     """Between the two moments around the time of each ray."""
     at = (time.clamp(-1, 1) + 1) / 2 * (len(grid) - 1)
     first = at.detach().long().clamp(max=len(grid) - 2)
-    every = torch.stack([_trilinear(moment, points) for moment in grid])  # [t, b, s, 4]
+    every = torch.stack([trilinear(moment, points) for moment in grid])  # [t, b, s, 4]
     ray = torch.arange(len(time), device=time.device)
     later = (at - first)[:, None, None]
     return (1 - later) * every[first, ray] + later * every[first + 1, ray]
-
-
-def _trilinear(grid: Tensor, points: Tensor) -> Float[Tensor, "b s 4"]:
-    image, place = grid.permute(3, 0, 1, 2)[None], points[None, None]
-    found = F.grid_sample(image, place, padding_mode="zeros", align_corners=True)
-    return found[0, :, 0].permute(1, 2, 0)
 
 
 @march_through_time.exemplify

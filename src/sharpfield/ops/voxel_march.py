@@ -9,6 +9,7 @@ Source: direct voxel grids, DVGO (CVPR 2022) for the activations, Plenoxels (CVP
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 import torch.nn.functional as F
@@ -41,24 +42,36 @@ def march(
         opaque_end: The last sample stops all light.
     """
     points = origin[:, None] + place[..., None] * direction[:, None]
+    raw = reduce(torch.add, [trilinear(grid, points) for grid in grids])
+    return light_of(raw, points, place, opaque_end=opaque_end)
+
+
+def trilinear(
+    grid: Float[Tensor, "_ _ _ 4"], points: Float[Tensor, "b s 3"]
+) -> Float[Tensor, "b s 4"]:
+    """Values between the cells."""
+    image, at = grid.permute(3, 0, 1, 2)[None], points[None, None]
+    found = F.grid_sample(image, at, padding_mode="zeros", align_corners=True)
+    return found[0, :, 0].permute(1, 2, 0)
+
+
+def light_of(
+    raw: Float[Tensor, "b s 4"],
+    points: Float[Tensor, "b s 3"],
+    place: Float[Tensor, "b s"],
+    *,
+    opaque_end: bool,
+) -> Float[Tensor, "b 5"]:
+    """Red, green, blue, depth and opacity, given what all grids together hold at the samples."""
     inside = (points.abs() <= 1).all(-1)
-    looked = [
-        F.grid_sample(
-            grid.permute(3, 0, 1, 2)[None],
-            points[None, None],
-            padding_mode="zeros",
-            align_corners=True,
-        )[0, :, 0]
-        for grid in grids
-    ]
-    found = torch.stack(looked).sum(0) * inside  # [4, b, s]
-    alpha = (1 - torch.exp(-F.softplus(found[0] + THIN))) * inside
+    raw = raw * inside[..., None]
+    alpha = (1 - torch.exp(-F.softplus(raw[..., 0] + THIN))) * inside
     if opaque_end:
         alpha = torch.cat([alpha[:, :-1], torch.ones_like(alpha[:, -1:])], -1)
     weights = weights_of_opacities(alpha)
-    colour = torch.sigmoid(found[1:]).permute(1, 2, 0)
     depth = (weights * place).sum(-1, keepdim=True)
-    return torch.cat([gather(weights, colour), depth, weights.sum(-1, keepdim=True)], -1)
+    colour = gather(weights, torch.sigmoid(raw[..., 1:]))
+    return torch.cat([colour, depth, weights.sum(-1, keepdim=True)], -1)
 
 
 @march.exemplify

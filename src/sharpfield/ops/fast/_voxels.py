@@ -1,83 +1,94 @@
 # pyright: basic
-"""What kernels do at the cells of a voxel grid `[d, h, w, 4]`: find them, read them, add to them.
+"""What kernels do at the cells of voxel grids `[d, h, w, 4]`: find them, read them, add to them.
 
-Points are in box coordinates, see `ops.voxel_march`.
+Points are in box coordinates, see `ops.voxel_march`. The eight *corners* of the cell that a point
+is in are numbered 0...7, along x first. A *spot* is a point located in a grid: four values that
+were read or are to be added there, the first corner, and how near the next is along each axis.
 """
-
-import math
 
 import numpy as np
 
-from sharpfield.ops.fast._kernel import kernel, share
+from sharpfield.ops.fast._kernel import kernel
+from sharpfield.ops.fast._lanes import lanes_for, load, store
+
+FOUR = lanes_for(4)
+"""Raw density and raw colour."""
 
 
 @kernel
-def locate(grid, x, y, z, corner, weight):
-    """The cell below a point along each axis, and the share of the next one; False outside."""
-    depth, height, width = grid.shape[0], grid.shape[1], grid.shape[2]
-    if not (-1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0):
-        return False
-    px = (x + 1.0) * 0.5 * (width - 1)
-    py = (y + 1.0) * 0.5 * (height - 1)
-    pz = (z + 1.0) * 0.5 * (depth - 1)
-    corner[0] = min(int(px), width - 2)
-    corner[1] = min(int(py), height - 2)
-    corner[2] = min(int(pz), depth - 2)
-    weight[0] = np.float32(px - corner[0])
-    weight[1] = np.float32(py - corner[1])
-    weight[2] = np.float32(pz - corner[2])
-    return True
+def new_spot():
+    """Room for one."""
+    return np.empty(4, np.float32), np.empty(3, np.int64), np.empty(3, np.float32)
 
 
 @kernel
-def look(grid, corner, weight, found):
-    """Add the trilinear values at a located point."""
-    a, b, c, d = found[0], found[1], found[2], found[3]
-    for k in range(2):
-        wz = weight[2] if k else np.float32(1.0) - weight[2]
-        for j in range(2):
-            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
-            for i in range(2):
-                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
-                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
-                a += w * cell[0]
-                b += w * cell[1]
-                c += w * cell[2]
-                d += w * cell[3]
-    found[0], found[1], found[2], found[3] = a, b, c, d
+def point_on(rays, ray, z):
+    """The point of a ray at `z`."""
+    origin, direction = rays[0], rays[1]
+    return (
+        origin[ray, 0] + z * direction[ray, 0],
+        origin[ray, 1] + z * direction[ray, 1],
+        origin[ray, 2] + z * direction[ray, 2],
+    )
 
 
 @kernel
-def softplus(raw):
-    return raw if raw > 15.0 else math.log1p(math.exp(raw))
+def inside(point):
+    """Whether a point is in the box."""
+    x, y, z = point
+    return -1.0 <= x <= 1.0 and -1.0 <= y <= 1.0 and -1.0 <= z <= 1.0
 
 
 @kernel
-def sigmoid(raw):
-    return 1.0 / (1.0 + math.exp(-raw))
+def locate(grid, point, spot):
+    """Find a point inside the box among the cells of a grid."""
+    _, first, nearness = spot
+    for axis in range(3):
+        size = grid.shape[2 - axis]
+        at = (point[axis] + 1.0) * 0.5 * (size - 1)
+        first[axis] = min(int(at), size - 2)
+        nearness[axis] = np.float32(at - first[axis])
 
 
 @kernel
-def add(grid, corner, weight, a, b, c, d):
-    """Add to the eight cells around a located point."""
-    for k in range(2):
-        wz = weight[2] if k else np.float32(1.0) - weight[2]
-        for j in range(2):
-            wy = wz * (weight[1] if j else np.float32(1.0) - weight[1])
-            for i in range(2):
-                w = wy * (weight[0] if i else np.float32(1.0) - weight[0])
-                cell = grid[corner[2] + k, corner[1] + j, corner[0] + i]
-                cell[0] += w * a
-                cell[1] += w * b
-                cell[2] += w * c
-                cell[3] += w * d
+def corner(spot, number):
+    """Indices of a corner along z, y and x."""
+    first = spot[1]
+    return first[2] + (number >> 2), first[1] + (number >> 1 & 1), first[0] + (number & 1)
 
 
 @kernel
-def merge(worker, workers, sums):
-    """Add all parts to the first, slice by slice."""
-    for level in range(len(sums)):
-        total = sums[level]
-        for z in range(*share(worker, workers, total.shape[1])):
-            for part in range(1, len(total)):
-                total[0, z] += total[part, z]
+def share_of_corner(spot, number, whole):
+    """The share of a corner in a `whole` that all eight have together."""
+    x, y, z = spot[2]
+    whole *= z if number & 4 else np.float32(1.0) - z
+    whole *= y if number & 2 else np.float32(1.0) - y
+    return whole * (x if number & 1 else np.float32(1.0) - x)
+
+
+@kernel
+def look(grids, point, spot):
+    """Add what all grids hold at a point to the values of a spot."""
+    for level in range(len(grids)):
+        grid = grids[level]
+        locate(grid, point, spot)
+        found = load(spot[0], 0, FOUR)
+        for number in range(8):
+            z, y, x = corner(spot, number)
+            at = 4 * ((z * grid.shape[1] + y) * grid.shape[2] + x)
+            found += load(grid, at, FOUR) * share_of_corner(spot, number, np.float32(1.0))
+        store(spot[0], 0, found)
+
+
+@kernel
+def add(grids, point, spot):
+    """Add the values of a spot to all grids at a point: the way back of `look`."""
+    for level in range(len(grids)):
+        grid = grids[level]
+        locate(grid, point, spot)
+        added = load(spot[0], 0, FOUR)
+        for number in range(8):
+            z, y, x = corner(spot, number)
+            at = 4 * ((z * grid.shape[1] + y) * grid.shape[2] + x)
+            w = share_of_corner(spot, number, np.float32(1.0))
+            store(grid, at, load(grid, at, FOUR) + added * w)
