@@ -1,13 +1,16 @@
 """The events command on a tiny run: what it writes, what it prints, how it refuses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sharpfield.captures.event_cache import read_events
+from sharpfield.core.events import merged
 from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import write_events
 from tests.cli.test_commands import run
 
 FAST = ("--step-ms", 10, "--shortest-ms", 5)
@@ -134,6 +137,57 @@ def test_a_camera_that_was_on_before_goes_on(splats: Path, tmp_path: Path) -> No
     after = rows[0][rows[0][:, 0] >= 40_000]
     np.testing.assert_array_equal(rows[1], after)
     assert len(rows[2]) != len(after) or (rows[2] != after).any()
+
+
+def test_events_of_two_stretches_add_up(splats: Path, tmp_path: Path) -> None:
+    """Also where a stretch ends within a step of time."""
+    ends = {"first": (20, 47), "second": (47, 80), "both": (20, 80)}
+    rows = {}
+    for name, (start, end) in ends.items():
+        out = tmp_path / f"{name}.csv"
+        assert run("events", splats, "--out", out, "--from", start, "--to", end, "--on", 0) == 0
+        rows[name] = np.loadtxt(out, np.int64, delimiter=",", skiprows=1)
+    assert min(map(len, rows.values())) > 100
+    np.testing.assert_array_equal(np.concatenate([rows["first"], rows["second"]]), rows["both"])
+
+
+def test_a_view_of_a_rigs_recording_can_be_compared_with(splats: Path, tmp_path: Path) -> None:
+    words = ("--from", 20, "--to", 80, "--on", 0, *FAST)
+    first, rig, out = (tmp_path / name for name in ("first.h5", "rig.h5", "out.csv"))
+    assert run("events", splats, "--out", first, *words) == 0
+    with open_events(first) as file:
+        own = read_events(file)
+    turned = replace(own, x=own.width - 1 - own.x)
+    pair = [
+        replace(one, track=np.full(len(one), k, np.int16), tracks=2)
+        for k, one in enumerate((own, turned))
+    ]
+    write_events(rig, merged(pair))
+    assert run("events", splats, "--out", out, "--against", rig, *words) == 0
+    found = json.loads((tmp_path / "out-compare.json").read_text())
+    assert found["predicted"] == found["recorded"] == len(own) and found["timing_ms"] == 0
+
+
+def test_a_comparison_with_a_twin_that_says_nothing(splats: Path, tmp_path: Path) -> None:
+    """What cannot be said is null: NaN is no JSON."""
+    words = ("--threshold", 90, "--to", 40, "--compare", *FAST)
+    assert run("events", splats, "--out", tmp_path / "twin.h5", *words) == 0
+
+    def refuse(name: str) -> None:
+        raise AssertionError(f"{name} is no JSON")
+
+    found = json.loads((tmp_path / "twin-compare.json").read_text(), parse_constant=refuse)
+    assert found["predicted"] == 0 and found["timing_ms"] is None
+
+
+def test_what_cannot_be_compared_is_refused_before_rendering(
+    splats: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    large, out = tmp_path / "large.npz", tmp_path / "twin.h5"
+    assert run("events", splats, "--out", large, "--size", "24x16", "--to", 40, *FAST) == 0
+    assert run("events", splats, "--out", out, "--against", large, "--to", 40, *FAST) == 2
+    assert "(24, 16) recorded, (16, 12) rendered" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_thresholds_are_matched_and_said(

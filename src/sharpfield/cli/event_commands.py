@@ -15,6 +15,7 @@ from sharpfield.cli.event_output import (
     Tell,
     Wanted,
     compare,
+    expect_comparable,
     recorded_by,
     recorded_in,
     telling,
@@ -150,7 +151,7 @@ def events(
     whole = _seat(opened, place, pixels.sensor)
     seat = whole.between(*_ends(place))
     span = _switched_on(whole, seat, place, extra)
-    recorded = _recorded(opened.capture, place, extra, span)
+    recorded = _recorded(opened.capture, place, extra, seat)
     edges = windows(*seat.span_us, us(PIECE_MS if extra.frames is None else extra.frames))
     sensor = _sensor(opened.capture, pixels)
     if pixels.match:
@@ -163,7 +164,8 @@ def events(
     )
     with telling(console, span) as (look, tell):
         light = light_of(opened.model, seat, subpixels=pixels.subpixels, progress=look)
-        twin = EventTwin(light, span, sensor, pace=pixels.pace(), seed=pixels.seed)
+        seen = _whole_steps(span, whole.span_us[1], pixels.pace())
+        twin = EventTwin(light, seen, sensor, pace=pixels.pace(), seed=pixels.seed)
         made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
     say = f"{made.count:,} events, from {twin.looks} pictures, are in {out}"
     console.print(say, highlight=False)
@@ -224,6 +226,13 @@ def _switched_on(
     return on, end
 
 
+def _whole_steps(span_us: tuple[int, int], last_us: int, pace: Pace) -> tuple[int, int]:
+    """The span with all of its last step, so that where it is cut changes nothing before."""
+    start, end = span_us
+    steps = -(-(end - start) // pace.step_us)
+    return start, min(start + steps * pace.step_us, last_us)
+
+
 def _matched(
     console: Console, opened: Opened, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
 ) -> EventSensor:
@@ -271,12 +280,17 @@ def _sensor(capture: Capture, pixels: Pixels) -> EventSensor:
 
 
 def _recorded(
-    capture: Capture, place: Place, extra: Windows, span_us: tuple[int, int]
+    capture: Capture, place: Place, extra: Windows, seat: Viewpoint
 ) -> EventStream | None:
-    """What to compare with, if anything."""
+    """What to compare with, if anything; looked at before anything is rendered."""
+    if not extra.compares:
+        return None
     if extra.against is not None:
-        return recorded_in(extra.against, span_us)
-    return recorded_by(capture, place.view or 0) if extra.compare else None
+        recorded = recorded_in(extra.against, seat.span_us, place.view or 0)
+    else:
+        recorded = recorded_by(capture, place.view or 0)
+    expect_comparable(recorded, seat)
+    return recorded
 
 
 def _expect_sense(place: Place, extra: Windows) -> None:

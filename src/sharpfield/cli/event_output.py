@@ -1,6 +1,7 @@
 """What the `events` command writes and prints: streams as they come, frames, comparisons."""
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -16,6 +17,7 @@ from sharpfield.core.events import EventStream, merged
 from sharpfield.core.files import replacing
 from sharpfield.evaluation.event_agreement import agreement, side_by_side
 from sharpfield.evaluation.event_frames import count_events, writing_frames
+from sharpfield.evaluation.event_twin import Viewpoint
 from sharpfield.recordings.open import open_events
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
@@ -86,8 +88,8 @@ def recorded_by(capture: Capture, view: int) -> EventStream:
     )
 
 
-def recorded_in(path: Path, span_us: tuple[int, int]) -> EventStream:
-    """The events of any file in a stretch of time, both ends included.
+def recorded_in(path: Path, span_us: tuple[int, int], view: int) -> EventStream:
+    """The events of any file in a stretch of time, both ends included; of a rig, those of a view.
 
     Raises:
         CaptureError: The file is none, or has nothing then.
@@ -96,7 +98,8 @@ def recorded_in(path: Path, span_us: tuple[int, int]) -> EventStream:
     for part in open_events(path).chunks():
         if part.t_us[0] > span_us[1]:
             break
-        found.append(part.window(span_us[0], span_us[1] + 1))
+        own = part.window(span_us[0], span_us[1] + 1)
+        found.append(own if own.track is None else own.of_track(view))
     if not sum(map(len, found)):
         raise CaptureError(
             "nothing was recorded at the time that is rendered",
@@ -105,6 +108,24 @@ def recorded_in(path: Path, span_us: tuple[int, int]) -> EventStream:
             do="times of the file must be on the clock of the capture",
         )
     return merged(found)
+
+
+def expect_comparable(recorded: EventStream, seat: Viewpoint) -> None:
+    """Refuse a recording that has other pixels than the twin, or nothing to say about its time.
+
+    Raises:
+        OptionError: So it is.
+    """
+    if (size := (recorded.width, recorded.height)) != seat.camera.size:
+        raise OptionError(
+            "the two sensors differ in size", got=f"{size} recorded, {seat.camera.size} rendered"
+        )
+    if not len(recorded.window(*seat.span_us)):
+        raise OptionError(
+            "nothing was recorded at the time that is rendered, by this camera",
+            got=f"from {seat.span_us[0]} to {seat.span_us[1]} us",
+            do="name another time with --from and --to",
+        )
 
 
 def compare(
@@ -123,13 +144,16 @@ def compare(
         edges_us: Where windows begin and end.
         about: What else the file of numbers should say.
     """
-    found = asdict(agreement(*streams, edges_us))
+    found = {
+        name: value if math.isfinite(value) else None
+        for name, value in asdict(agreement(*streams, edges_us)).items()
+    }
     table, picture = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
     with replacing(table) as temporary:
-        temporary.write_text(json.dumps(found | about, indent=2) + "\n")
+        temporary.write_text(json.dumps(found | about, indent=2, allow_nan=False) + "\n")
     write_image(picture, side_by_side(*streams, edges_us))
     for name, value in found.items():
-        shown = f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
+        shown = "-" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
         console.print(f"  {name:<18} {shown}", highlight=False)
     console.print(f"Recorded and rendered side by side: {picture}", highlight=False)
 
