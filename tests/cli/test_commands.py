@@ -204,3 +204,12 @@ def test_nanoseconds_taken_for_microseconds_are_noticed(
     capsys.readouterr()
     assert run("inspect", out) == 2
     assert "ns" in capsys.readouterr().err
+
+
+def test_a_place_that_cannot_be_written_is_one_message(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert run("deblur", recorded, "--out", tmp_path / "file" / "sharp") == 2
+    said = capsys.readouterr().err
+    assert str(tmp_path / "file") in said and "Traceback" not in said

@@ -58,5 +58,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SharpfieldError as error:
         print(error, file=sys.stderr)
         sys.exit(2)
+    except OSError as error:
+        if not error.strerror:
+            raise
+        said = SharpfieldError(
+            error.strerror,
+            where=error.filename or "",
+            do="check that the path exists, may be read or written, and has room",
+        )
+        print(said, file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
