@@ -1,3 +1,4 @@
+import json
 import runpy
 import signal
 import subprocess
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sharpfield.core import files
-from sharpfield.core.files import replacing, replacing_folder
+from sharpfield.core.files import replacing, replacing_folder, write_json
 
 
 def test_the_new_file_takes_the_place_of_the_old(tmp_path: Path):
@@ -18,6 +19,22 @@ def test_the_new_file_takes_the_place_of_the_old(tmp_path: Path):
             temporary.write_text(text)
         assert path.read_text() == text
     assert list(path.parent.iterdir()) == [path]
+
+
+def test_plain_values_are_written_as_lines_in_place_of_what_was_there(tmp_path: Path):
+    path = tmp_path / "new" / "about.json"
+    for about in ({"loss": 0.5, "names": ["a"]}, [None, True]):
+        write_json(path, about)
+        assert json.loads(path.read_text()) == about
+    assert path.read_text() == "[\n  null,\n  true\n]\n"
+
+
+def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path):
+    write_json(tmp_path / "a.json", {"step": 1})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        write_json(tmp_path / "a.json", {"step": object()})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"step": 1}
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.json"]
 
 
 def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path: Path):

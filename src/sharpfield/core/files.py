@@ -1,11 +1,13 @@
 """Writing without half-written results: everything goes to a temporary name first, then moves."""
 
 import contextlib
+import json
 import os
 import shutil
 import tempfile
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 
 @contextlib.contextmanager
@@ -26,6 +28,12 @@ def replacing(path: Path) -> Generator[Path, None, None]:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, about: Any) -> None:
+    """Write plain values for people and programs to read, in place of what was at `path`."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(about, indent=2) + "\n")
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """What calibration leaves behind: numbers, a map of the pixels' thresholds, a picture of it."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.files import replacing
+from sharpfield.core.files import replacing, write_json
 from sharpfield.preparation.calibrate import Calibration
 from sharpfield.preparation.thresholds import known_thresholds
 from sharpfield.storage.arrays import write_arrays
@@ -27,8 +26,7 @@ def write_calibration(capture: Capture, made: Calibration, out: Path) -> dict[st
     """Write `calibration.json`, `pixels.npz` and `pixels.png` to a folder; returns the numbers."""
     out.mkdir(parents=True, exist_ok=True)
     about = summary(capture, made)
-    with replacing(out / NUMBERS) as temporary:
-        temporary.write_text(json.dumps(about, indent=2) + "\n")
+    write_json(out / NUMBERS, about)
     with replacing(out / PIXELS) as temporary:
         write_arrays(
             temporary,

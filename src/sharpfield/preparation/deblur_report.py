@@ -1,6 +1,5 @@
 """What deblurring leaves behind: pictures, a sheet of before and after, numbers."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import torch
 from jaxtyping import Shaped, UInt8
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.formation.edi_threshold import edge_density
 from sharpfield.metrics.image import psnr
 from sharpfield.metrics.sharpness import gradient_energy, luma
@@ -35,8 +34,7 @@ def deblur_to(capture: Capture, out: Path, options: DeblurOptions) -> Deblurred:
         for name, picture in zip(names, pictures, strict=True):
             write_image(out / name, picture)
     write_image(out / "contact.png", contact_sheet(capture, made))
-    with replacing(out / "deblur.json") as temporary:
-        temporary.write_text(json.dumps(summary(capture, made), indent=2) + "\n")
+    write_json(out / "deblur.json", summary(capture, made))
     return made
 
 

@@ -19,7 +19,7 @@ from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Note, Split
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.exposure import Exposure
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.core.frames import Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import Stamped, Still
@@ -261,8 +261,7 @@ class _Ingest:
                 "sifted": [sieve.of_hot, sieve.lonely, sieve.outside],
                 "left_out": self._left,
             }
-            with replacing(self._stage.events) as temporary:
-                temporary.write_text(json.dumps(told))
+            write_json(self._stage.events, told)
         self._stage.join()
         return sieve
 

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 
 from sharpfield.captures.native_frames import PLAIN_NAME
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.preparation.ingest_lens import Geometry
 from sharpfield.recordings.recording import Frame
 from sharpfield.storage.images import write_image
@@ -112,8 +112,7 @@ def remember(taken: Taken, path: Path) -> None:
         "shape": taken.shape,
         "bits": taken.bits,
     }
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(about))
+    write_json(path, about)
 
 
 def recalled(path: Path) -> Taken:

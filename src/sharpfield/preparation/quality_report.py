@@ -1,6 +1,5 @@
 """Which frames of a video are sharp: scores, weights, and a picture of the ranking."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import replacing, write_json
 from sharpfield.metrics.quality import Means, Quality, Way, event_quality, quality
 
 SHOWN = 5
@@ -79,8 +78,7 @@ def as_table(capture: Capture, found: Quality, told_by: str) -> dict[str, Any]:
 def quality_to(capture: Capture, found: Quality, told_by: str, out: Path) -> None:
     """Write `quality.json`, `ranking.png` and `weights.npy` (a weight for each judged frame)."""
     out.mkdir(parents=True, exist_ok=True)
-    with replacing(out / "quality.json") as temporary:
-        temporary.write_text(json.dumps(as_table(capture, found, told_by), indent=2) + "\n")
+    write_json(out / "quality.json", as_table(capture, found, told_by))
     with replacing(out / "weights.npy") as temporary:
         np.save(temporary, found.weights)
     with replacing(out / "ranking.png") as temporary:

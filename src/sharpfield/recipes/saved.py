@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sharpfield.core.errors import RunError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.recipes import recipe_named
 
 FILE = "recipe.json"
@@ -48,8 +48,7 @@ class Started:
 
 def write_started(run: Path, started: Started) -> None:
     """Write `RUN/recipe.json`."""
-    with replacing(run / FILE) as temporary:
-        temporary.write_text(json.dumps(started.settings(), indent=2) + "\n")
+    write_json(run / FILE, started.settings())
 
 
 def read_started(run: Path) -> Started:

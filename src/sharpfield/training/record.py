@@ -10,7 +10,7 @@ from pathlib import Path
 from torch.optim import Optimizer
 
 from sharpfield.core.errors import RunError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
 from sharpfield.training.checkpoint import Progress, save_best, save_last
 from sharpfield.training.fit import Hook
@@ -43,8 +43,7 @@ class Ledger:
 
 def write_ledger(run: Path, ledger: Ledger) -> None:
     """Write `RUN/training.json`."""
-    with replacing(run / "training.json") as temporary:
-        temporary.write_text(json.dumps(dataclasses.asdict(ledger), indent=2) + "\n")
+    write_json(run / "training.json", dataclasses.asdict(ledger))
 
 
 def read_ledger(run: Path) -> Ledger | None:
