@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from benchmarks.table import Row, save, show
-from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.arguments import parse_size
 from sharpfield.core.files import replacing_folder
 
 HALL = np.array([12.0, 3.0, 9.0])

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures.blocks import blocks_of
 from sharpfield.captures.read import read
-from sharpfield.cli.run_commands import OPTIONS, READING, Choice, Device, changed
+from sharpfield.cli.arguments import Device
+from sharpfield.cli.run_commands import OPTIONS, READING, Choice, changed
 from sharpfield.cli.runs import Reading, device_named, open_run, start
+from sharpfield.cli.screen import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import recipe_named
@@ -66,7 +67,7 @@ def blocks(
     """
     if choice.block:
         raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
-    console, where, count = Console(), device_named(device), choice.count
+    console, where, count = screen(), device_named(device), choice.count
     source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
@@ -80,7 +81,7 @@ def blocks(
         block, done = started[i], read_ledger(runs[i])
         if done is not None and done.finished:
             continue
-        console.print(f"Block {block.block}", highlight=False)
+        console.print(f"Block {block.block}")
         going_on = replace(options, resume=options.resume or done is not None)
         start(block, source, runs[i], going_on, device=where, console=console)
     ledgers = [ledger for run in runs if (ledger := read_ledger(run)) is not None]
@@ -88,7 +89,7 @@ def blocks(
         together = _together(ledgers)
         if not _up_to_date(whole, together, out, runs):
             _merge(whole, source, out, runs, together)
-        console.print(f"Merged. `sharpfield evaluate {out}` measures it.", highlight=False)
+        console.print(f"Merged. `sharpfield evaluate {out}` measures it.")
 
 
 def _mine(count: int, environment: Mapping[str, str]) -> range:

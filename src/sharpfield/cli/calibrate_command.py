@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures import native
 from sharpfield.captures.read import read_unposed
+from sharpfield.cli.screen import screen
 from sharpfield.preparation.calibrate import CalibrateOptions
 from sharpfield.preparation.calibrate import calibrate as measure
 from sharpfield.preparation.calibrate_report import PICTURE, as_text, write_calibration
@@ -32,11 +32,9 @@ def calibrate(
     held = read_unposed(capture)
     made = measure(held, options)
     about = write_calibration(held, made, out)
-    console = Console()
-    console.print(as_text(about), highlight=False, soft_wrap=True)
-    console.print(
-        f"Numbers and a map of the pixels are in {out}; see {out / PICTURE}", highlight=False
-    )
+    console = screen()
+    console.print(as_text(about), soft_wrap=True)
+    console.print(f"Numbers and a map of the pixels are in {out}; see {out / PICTURE}")
     if write_capture is not None:
         notes = held.notes | {"threshold_off": made.negative, "threshold_on": made.positive}
         native.write(replace(held, notes=notes, name=write_capture.name), write_capture)

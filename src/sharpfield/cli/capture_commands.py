@@ -3,15 +3,15 @@
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-import tyro
-from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures import native, write_evdnerf, write_llff_events, write_scannet
 from sharpfield.captures.read import read_unposed
 from sharpfield.captures.summary import summary
+from sharpfield.cli.arguments import Size, parse_size
+from sharpfield.cli.screen import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.preparation.deblur import DeblurOptions
@@ -40,8 +40,6 @@ from sharpfield.simulation import (
     video_footage,
 )
 from sharpfield.simulation import simulate as simulate_scene
-
-Size = Annotated[str, tyro.conf.arg(metavar="WxH")]
 
 
 @dataclass(frozen=True)
@@ -283,7 +281,7 @@ def deblur(
         options: Method, instants.
     """
     deblur_to(read_unposed(capture, layout=layout), out, options)
-    Console().print(f"Sharp frames are in {out}", highlight=False)
+    screen().print(f"Sharp frames are in {out}")
 
 
 def write(capture: Capture, out: Path, layout: str) -> None:
@@ -295,18 +293,6 @@ def write(capture: Capture, out: Path, layout: str) -> None:
         "scannet": write_scannet,
     }
     writers[layout].write(capture, out)
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Width and height from `WxH`.
-
-    Raises:
-        OptionError: It is not of that form.
-    """
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) > 7 and int(height) > 7):
-        raise OptionError("cannot read the size", got=text, do="give it like 240x160, at least 8x8")
-    return int(width), int(height)
 
 
 def as_text(found: dict[str, Any], indent: int = 0) -> str:
@@ -333,4 +319,4 @@ def _known(name: str, value: str, names: Any) -> None:
 def _say_made(made: Capture, out: Path) -> None:
     frames = 0 if made.frames is None else len(made.frames)
     events = sum(len(one) for one in (made.events, made.test_events) if one is not None)
-    Console().print(f"{frames} frames and {events:,} events are in {out}", highlight=False)
+    screen().print(f"{frames} frames and {events:,} events are in {out}")

@@ -8,8 +8,9 @@ import numpy as np
 from rich.console import Console
 
 from sharpfield.captures import native
-from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.arguments import Device, Size, parse_size
 from sharpfield.cli.runs import device_named, measure, open_run, start
+from sharpfield.cli.screen import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
@@ -47,25 +48,25 @@ OURS = Contender("ev-splat", "ev-splat", deblurred=False, use=("frames", "events
 
 def demo(
     out: Path = Path("runs/demo"),
-    size: str = "240x160",
+    size: Size = "240x160",
     scene: str = "garden",
     minutes: float = 1.0,
     seed: int = 0,
-    device: str = "auto",
+    device: Device = "auto",
 ) -> None:
     """Record a scene with a shaky camera, rebuild it sharply, and compare with two baselines.
 
     Args:
         out: Folder of the run; its report.html shows everything.
-        size: Of the simulated camera, WxH.
+        size: Of the simulated camera, in pixels.
         scene: A closed-form scene by name.
         minutes: Training time of each of the three methods.
         seed: Of the recording and of training.
         device: Where to train.
     """
-    console = Console()
+    console = screen()
     rig = Rig(parse_size(size), event_sensor=SENSORS["dvs346"])
-    console.print(f"Recording the scene {scene!r} at {size}", highlight=False)
+    console.print(f"Recording the scene {scene!r} at {size}")
     capture = replace(simulate(scene, rig=rig, timing=STRONG_BLUR, seed=seed), name=scene)
     native.write(capture, out / "capture")
     sharper = with_deblurred_frames(capture)
@@ -77,8 +78,8 @@ def demo(
         metrics = _compete(contender, out, run, minutes, seed, device, console)
         baselines[contender.name] = {"mean": metrics["mean"], "run": f"baselines/{contender.name}"}
     metrics = _compete(OURS, out, out, minutes, seed, device, console, baselines=baselines)
-    console.print(markdown(methods_table(metrics)), highlight=False)
-    console.print(f"\nOpen {out / 'report.html'}", highlight=False)
+    console.print(markdown(methods_table(metrics)))
+    console.print(f"\nOpen {out / 'report.html'}")
 
 
 def with_deblurred_frames(capture: Capture) -> Capture:
@@ -104,7 +105,7 @@ def _compete(
     baselines: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Train and measure one method."""
-    console.print(f"Training {contender.name} for {minutes:g} min", highlight=False)
+    console.print(f"Training {contender.name} for {minutes:g} min")
     where = device_named(device)
     source = out / ("capture-edi" if contender.deblurred else "capture")
     capture = native.read(source)

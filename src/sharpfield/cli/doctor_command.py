@@ -6,12 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from tyro.conf import Positional
 
 from sharpfield.cli.doctor_page import verdict, write_page
-from sharpfield.core.files import replacing
+from sharpfield.cli.screen import screen
+from sharpfield.core.files import write_json
 from sharpfield.preparation.doctor import examine_path
 from sharpfield.preparation.doctor_findings import Checkup
 from sharpfield.storage.images import write_image
@@ -42,14 +42,12 @@ def doctor(
     about = as_json(checkup)
     print(_text(about)) if json else _print(checkup)
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        with replacing(out / FINDINGS) as temporary:
-            temporary.write_text(_text(about) + "\n")
+        write_json(out / FINDINGS, about)
         for number, pixels in enumerate(checkup.pictures.values()):
             write_image(out / f"picture_{number}.png", pixels)
         write_page(out / PAGE, checkup, held)
         if not json:
-            Console().print(f"The page is {out / PAGE}", highlight=False, soft_wrap=True)
+            screen().print(f"The page is {out / PAGE}", soft_wrap=True)
     if checkup.has("error"):
         sys.exit(UNSOUND)
 
@@ -70,15 +68,14 @@ def _text(about: dict[str, Any]) -> str:
 
 
 def _print(checkup: Checkup) -> None:
-    console = Console()
+    console = screen()
     for one in checkup.sorted:
         style = STYLE[one.severity]
         console.print(
             f"[{style}]{one.severity:<8}[/] {escape(one.check)}: {escape(one.what)}",
-            highlight=False,
             soft_wrap=True,
         )
         for label, text in (("got", one.got), ("do", one.do)):
             if text:
-                console.print(f"  {label:<6} {escape(text)}", highlight=False, soft_wrap=True)
-    console.print(f"{verdict(checkup)}.", highlight=False, soft_wrap=True)
+                console.print(f"  {label:<6} {escape(text)}", soft_wrap=True)
+    console.print(f"{verdict(checkup)}.", soft_wrap=True)

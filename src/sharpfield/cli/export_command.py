@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.cli.runs import Opened, open_run
+from sharpfield.cli.screen import screen
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.splat_export import export_splats
 from sharpfield.recipes.splat_model import SplatModel
@@ -43,7 +43,7 @@ def export(
         change=model.change.inverse(),
         comments=(f"sharpfield {opened.started.name}", *antialiased),
     )
-    Console().print(f"{len(scene.gaussians):,} Gaussians are in {out}", highlight=False)
+    screen().print(f"{len(scene.gaussians):,} Gaussians are in {out}")
 
 
 def _with_gaussians(opened: Opened, run: Path) -> SplatModel:

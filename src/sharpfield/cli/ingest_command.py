@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -19,7 +18,8 @@ from rich.progress import (
 )
 from tyro.conf import Positional
 
-from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.arguments import End, Size, Start, parse_size
+from sharpfield.cli.screen import progress_on, screen
 from sharpfield.core.errors import OptionError
 from sharpfield.preparation.ingest import Ingested, Tell
 from sharpfield.preparation.ingest import ingest as ingest_recordings
@@ -33,9 +33,6 @@ FRAMES_ONLY = ("video", "pictures")
 """Formats that hold no events."""
 
 NO_MISTAKES = Mistakes()
-Size = Annotated[str | None, tyro.conf.arg(metavar="WxH")]
-Start = Annotated[float | None, tyro.conf.arg(name="from", metavar="MS")]
-End = Annotated[float | None, tyro.conf.arg(name="to", metavar="MS")]
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ class Source:
     """Format of the file of events; by default it is recognised. See docs/ingest.md."""
     unit: str | None = None
     """Of the times of events: ns, us, ms or s."""
-    size: Size = None
+    size: Size | None = None
     """Of the event sensor, in pixels."""
     topic: str | None = None
     """Which of several cameras, streams or topics."""
@@ -164,16 +161,16 @@ def ingest(
     """
     if len(recordings) not in (1, 2):
         raise OptionError("give one recording, or two", got=len(recordings))
-    console = Console()
+    console = screen()
     source.expect_used(recordings)
     opened = tuple(source.opened(path) for path in recordings)
     for recording in opened:
-        console.print(f"{recording.path} is {recording.layout}", highlight=False)
+        console.print(f"{recording.path} is {recording.layout}")
     choices = Choices(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
     with _telling(console) as tell:
         made = ingest_recordings(opened, out, choices, tell)
     for line in _story(made, out):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
 
 
 def _story(made: Ingested, out: Path) -> Iterator[str]:
@@ -203,8 +200,7 @@ def _telling(console: Console) -> Iterator[Tell]:
         TimeRemainingColumn(),
     )
     tasks: dict[str, TaskID] = {}
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+    with progress_on(console, *columns) as progress:
 
         def tell(doing: str, done: int, total: int | None) -> None:
             if doing not in tasks:

@@ -1,6 +1,5 @@
 """`sharpfield poses`: find where the camera was, or attach what something else says of it."""
 
-import json
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures import native
@@ -16,9 +14,10 @@ from sharpfield.captures.folders import expect_replaceable
 from sharpfield.captures.pose_layouts import OuterPath, PathLayout, read_hand_eye, read_path
 from sharpfield.captures.read import read_unposed
 from sharpfield.cli.poses_page import write_page
+from sharpfield.cli.screen import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.preparation.poses_external import Mount, attach, known_at
 from sharpfield.preparation.poses_find import PoseOptions, find_poses
 from sharpfield.preparation.poses_report import as_text, summary
@@ -84,13 +83,11 @@ def poses(
     found = find_poses(original, options, known=known)
     native.write(replace(found.capture, name=out.name), out)
     about = summary(original, found)
-    _write_json(out / REPORT, about)
+    write_json(out / REPORT, about)
     write_page(out / PAGE, original, found, about)
-    console = Console()
-    console.print(as_text(about), highlight=False, soft_wrap=True)
-    console.print(
-        f"The capture with poses is in {out}; open {out / PAGE}", highlight=False, soft_wrap=True
-    )
+    console = screen()
+    console.print(as_text(about), soft_wrap=True)
+    console.print(f"The capture with poses is in {out}; open {out / PAGE}", soft_wrap=True)
 
 
 def _attach(
@@ -114,14 +111,9 @@ def _attach(
         "frames": {"before": len(names), "after": len(attached.kept), "left_out": lost},
         "bounds": {"near": made.near, "far": made.far},
     }
-    _write_json(out / REPORT, about)
+    write_json(out / REPORT, about)
     said = f"{len(path.poses)} poses ({path.layout}) attached; {len(attached.kept)} of"
     said += f" {len(names)} frames and {len(made.events or ()):,} events are covered"
     if lost:
         said += f"; left out: {', '.join(lost[:8])}{', ...' if len(lost) > 8 else ''}"
-    Console().print(f"{said}\nThe capture with poses is in {out}", highlight=False)
-
-
-def _write_json(path: Path, about: dict[str, object]) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(about, indent=2) + "\n")
+    screen().print(f"{said}\nThe capture with poses is in {out}")

@@ -3,11 +3,11 @@
 import json as json_format
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional
 
 from sharpfield.captures.read import read
+from sharpfield.cli.screen import screen
 from sharpfield.preparation.blur_pictures import blur_pictures
 from sharpfield.preparation.quality_report import QualityOptions, as_table, judged, quality_to
 from sharpfield.simulation.motion_kernel import INTENSITY, PROBABILITY, SIZE, KernelRange
@@ -41,7 +41,7 @@ def quality(
     if json:
         print(json_format.dumps(about, indent=2))
         return
-    console = Console()
+    console = screen()
     ranked = sorted(about["frames"], key=lambda row: row["score"])
     shown = ranked if len(ranked) <= SHOWN else [*ranked[: SHOWN // 2], *ranked[-SHOWN // 2 :]]
     columns = list(shown[0])
@@ -52,9 +52,9 @@ def quality(
     console.print(table)
     if "rank_correlation" in about:
         said = f"Rank correlation with the true sharpness: {about['rank_correlation']:.3f}"
-        console.print(said, highlight=False)
+        console.print(said)
     if out is not None:
-        console.print(f"The ranking is in {out}", highlight=False)
+        console.print(f"The ranking is in {out}")
 
 
 def blur(
@@ -77,4 +77,4 @@ def blur(
     """
     made = blur_pictures(images, out, ranges=KernelRange(k, phi, probability), seed=seed)
     count = sum(row["blurred"] for row in made)
-    Console().print(f"{count} of {len(made)} pictures were blurred; see {out}", highlight=False)
+    screen().print(f"{count} of {len(made)} pictures were blurred; see {out}")

@@ -3,17 +3,18 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 import tyro
-from rich.console import Console
 from rich.progress import track
 from tyro.conf import Positional
 
 from sharpfield.captures.read import read
+from sharpfield.cli.arguments import Device
 from sharpfield.cli.runs import Reading, device_named, measure, open_run, start
+from sharpfield.cli.screen import screen
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation import Measuring, Refinement, camera_path, refine_poses, write_film
 from sharpfield.evaluation.report import flat
@@ -24,7 +25,6 @@ from sharpfield.recipes.saved import Started
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.training import Options
 
-Device = Literal["auto", "cpu", "cuda"]
 EIGHT_BIT = 255
 
 
@@ -68,7 +68,7 @@ def train(
         options: How long, how often to save, how much memory.
         reading: What to believe instead of the capture's layout.
     """
-    console, where = Console(), device_named(device)
+    console, where = screen(), device_named(device)
     source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
@@ -76,7 +76,7 @@ def train(
     started = Started(recipe, made, where_from, seed, choice.use, given, choice.block)
     ledger = start(started, source, out, options, device=where, console=console)
     if ledger.finished:
-        console.print(f"Done. `sharpfield evaluate {out}` measures it.", highlight=False)
+        console.print(f"Done. `sharpfield evaluate {out}` measures it.")
 
 
 def evaluate(
@@ -101,7 +101,7 @@ def evaluate(
         lpips_backbone: Weights file of torchvision's AlexNet or VGG16, to compute LPIPS.
         lpips_linear: Weights file of LPIPS's own linear layers.
     """
-    console = Console()
+    console = screen()
     opened = open_run(run, capture=capture, device=device)
     lpips = None
     if lpips_backbone is not None and lpips_linear is not None:
@@ -114,8 +114,8 @@ def evaluate(
     measuring = Measuring(train_views=train_views, lpips=lpips, poses=poses, stated=stated)
     metrics = measure(opened, run, console, measuring=measuring)
     mean = {name: value for name, value in metrics["mean"].items() if value is not None}
-    console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()), highlight=False)
-    console.print(f"The report is {run / 'report.html'}", highlight=False)
+    console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()))
+    console.print(f"The report is {run / 'report.html'}")
 
 
 def render(
@@ -138,7 +138,7 @@ def render(
         capture: Where the capture is, if it moved.
         device: Where to render.
     """
-    console = Console()
+    console = screen()
     opened = open_run(run, capture=capture, device=device)
     model = opened.model
     where = device_named(device)
@@ -154,7 +154,7 @@ def render(
         range(len(camera_moves)), "rendering", console=console, disable=not console.is_terminal
     )
     count = write_film(out, (rendered(number) for number in numbers), rate=rate)
-    console.print(f"{count} pictures are in {out}", highlight=False)
+    console.print(f"{count} pictures are in {out}")
 
 
 def eight_bit(picture: torch.Tensor) -> np.ndarray:

@@ -7,10 +7,10 @@ from typing import Any, Literal
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 
 from sharpfield.captures.blocks import blocks_of, limited, parsed
 from sharpfield.captures.read import read
+from sharpfield.cli.screen import progress_on
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.protocols import Model
@@ -28,9 +28,6 @@ from sharpfield.training import (
 )
 
 STREAMS = ("frames", "events")
-
-VALIDATED = 2
-"""Held-out views rendered for the curve that is drawn while training."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +180,7 @@ def measure(
 ) -> dict[str, Any]:
     """Evaluate a run and write its report."""
     started = opened.started
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with progress_on(console) as progress:
         task = progress.add_task("rendering", total=None)
         metrics = evaluate(
             opened.model,
