@@ -9,7 +9,9 @@ import pytest
 
 from sharpfield.core import Paper
 from sharpfield.core.capture import Split
+from sharpfield.core.events import merged
 from sharpfield.evaluation import Measuring, Story, evaluate, page, report, write_report
+from sharpfield.evaluation.captured import _strip
 from sharpfield.evaluation.compared import input_name
 from sharpfield.evaluation.page import Look, embedded
 from sharpfield.evaluation.report import flat
@@ -115,6 +117,25 @@ def test_frames_are_called_blurry_only_if_they_may_be():
     assert input_name(capture()) == "blurry input"
     assert input_name(sharp) == "input"
     assert input_name(replace(sharp, notes={"motion": "unknown"})) == "blurry input"
+
+
+def test_a_gain_over_the_blurry_input_is_told_only_where_it_is_blurry(tmp_path: Path):
+    sharp = replace(capture(), split=Split(np.array([0, 4]), np.array([1])))
+    for one, told in ((capture(), True), (sharp, False)):
+        metrics = evaluate(Sky(one), one, tmp_path)
+        page_text = checked(write_report(tmp_path, one, metrics, Story("input"))).text
+        assert ("over the blurry input" in page_text) == told
+
+
+def test_events_are_shown_of_the_camera_whose_frame_is_shown():
+    one, events = capture(), capture().needed_events
+    other = replace(events, x=events.width - 1 - events.x)
+    pair = [
+        replace(part, track=np.full(len(part), k, np.int16), tracks=2)
+        for k, part in enumerate((events, other))
+    ]
+    alone, rig = _strip(one)[1], _strip(replace(one, events=merged(pair)))[1]
+    np.testing.assert_array_equal(rig.pixels, alone.pixels)
 
 
 def test_events_alone_are_said_to_be_aligned(tmp_path: Path):

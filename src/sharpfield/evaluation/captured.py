@@ -69,20 +69,22 @@ def _counts(capture: Capture) -> dict[str, object]:
 
 
 def _strip(capture: Capture) -> list[Picture]:
-    """Some recorded training frames, and after the first the events around its middle."""
+    """Some recorded training frames, and after the first its camera's events around its middle."""
     frames, events = capture.frames, capture.events
-    pictures, middle_us = [], None
+    pictures, middle_us, camera = [], None, 0
     for i in spread(capture.split.train, STRIP) if frames is not None else []:
         assert frames is not None
         duration = frames.exposure.duration_us[i] / 1000
         caption = f"frame {frames.names[i]}" + (f", {duration:g} ms" if duration else "")
         pixels = eight_bit(as_display(frames.images[i]).numpy())
         pictures.append(Picture("frame", pixels, caption, f"Recorded {caption}"))
-        middle_us = int(frames.exposure.middle_us[i]) if middle_us is None else middle_us
+        if middle_us is None:
+            middle_us, camera = int(frames.exposure.middle_us[i]), int(frames.track[i])
     if events is not None and len(events):
         if middle_us is None:
             middle_us = int(events.t_us[0] + events.t_us[-1]) // 2
-        pixels = event_picture(events, middle_us - EVENTS_US // 2, middle_us + EVENTS_US // 2)
+        seen = events if events.track is None else events.of_track(camera)
+        pixels = event_picture(seen, middle_us - EVENTS_US // 2, middle_us + EVENTS_US // 2)
         caption = f"events of {EVENTS_US / 1000:g} ms: red brighter, blue darker"
         pictures.insert(1, Picture("events", pixels, caption, f"E{caption[1:]}"))
     return pictures

@@ -17,6 +17,7 @@ from sharpfield.storage.images import read_image
 VIEWS = 4
 """Most views of a kind to show; the tables have them all."""
 
+BLURRY, SHARP_INPUT = "blurry input", "input"
 RESULT, STORED, ERROR, DEPTH = "result", "stored image", "error", "depth"
 
 
@@ -24,7 +25,7 @@ def input_name(capture: Capture) -> str:
     """What to call recorded frames: blurry if they were, or may have been, exposed for a while."""
     frames = capture.frames
     lasting = frames is not None and not frames.exposure.instant[capture.split.train].all()
-    return "blurry input" if lasting or capture.notes.get("motion") == "unknown" else "input"
+    return BLURRY if lasting or capture.notes.get("motion") == "unknown" else SHARP_INPUT
 
 
 def compared_views(

@@ -15,7 +15,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.paper import Paper
 from sharpfield.evaluation import page
 from sharpfield.evaluation.captured import captured
-from sharpfield.evaluation.compared import RESULT, STORED, compared_views, input_name
+from sharpfield.evaluation.compared import BLURRY, RESULT, STORED, compared_views, input_name
 from sharpfield.evaluation.event_films import events_section
 from sharpfield.evaluation.figures import curves_figure
 from sharpfield.evaluation.page import Look, View, section
@@ -67,9 +67,10 @@ def write_report(run: Path, capture: Capture, metrics: Mapping[str, Any], story:
 def _body(run: Path, capture: Capture, metrics: Mapping[str, Any], story: Story, look: Look) -> str:
     train = compared_views(run, capture, metrics, metrics["train_views"]["views"])
     test = compared_views(run, capture, metrics, metrics["views"])
+    recorded = input_name(capture)
     parts = [
-        _header(metrics, story),
-        _result(train, test, metrics, look, recorded=input_name(capture)),
+        _header(metrics, story, recorded=recorded),
+        _result(train, test, metrics, look, recorded=recorded),
         events_section(run, metrics),
         captured(capture, look),
         _numbers(metrics),
@@ -82,16 +83,17 @@ def _body(run: Path, capture: Capture, metrics: Mapping[str, Any], story: Story,
     return "\n".join(part for part in parts if part)
 
 
-def _header(metrics: Mapping[str, Any], story: Story) -> str:
+def _header(metrics: Mapping[str, Any], story: Story, *, recorded: str) -> str:
     method = story.paper.title if story.paper is not None else ""
+    cards = page.cards(_headline(metrics, recorded))
     return (
         f'<header>\n<p class="eyebrow">sharpfield</p>\n<h1>{html.escape(story.title)}</h1>\n'
-        f'<p class="subtitle">{html.escape(method)}</p>\n{page.cards(_headline(metrics))}\n'
+        f'<p class="subtitle">{html.escape(method)}</p>\n{cards}\n'
         f"{_lpips_note(metrics['protocol']['lpips'])}</header>"
     )
 
 
-def _headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _headline(metrics: Mapping[str, Any], recorded: str) -> list[tuple[str, str, str]]:
     """Value, name and remark of the numbers one looks for first."""
     mean, cost, count = metrics["mean"], metrics["train"], len(metrics["views"])
     found = []
@@ -104,9 +106,9 @@ def _headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         found.append((number("lpips", mean), "LPIPS", metrics["protocol"]["lpips"]["network"]))
     after = metrics["train_views"]["mean"]["psnr"]
     before = metrics["train_views"]["input"]["mean"]["psnr"]
-    if after is not None and before is not None:
+    if recorded == BLURRY and after is not None and before is not None:
         remark = f"training views, {before:.2f} → {after:.2f}"
-        found.append((f"{after - before:+.2f} dB", "over the blurry input", remark))
+        found.append((f"{after - before:+.2f} dB", f"over the {recorded}", remark))
     if cost["seconds"] is not None:
         memory = cost["peak_memory_mb"]
         remark = f"{cost['steps']:,} steps" + (f", {memory / 1024:.1f} GiB" if memory else "")
