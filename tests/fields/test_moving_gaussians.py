@@ -23,7 +23,8 @@ def some(count: int = 5, span: float = 0.2) -> MovingGaussians:
     base = Gaussians.start(torch.rand(count, 3, generator=made), colours, torch.full((count,), 0.1))
     moving = MovingGaussians(base, torch.linspace(0.3, 0.7, count), span=span)
     with torch.no_grad():
-        for rows in (moving.velocities, moving.accelerations, moving.turns, moving.quaternions):
+        for name in ("velocities", "accelerations", "jerks", "turns", "quaternions"):
+            rows = getattr(moving, name)
             rows.copy_(torch.randn(rows.shape, generator=made))
     return moving
 
@@ -38,7 +39,7 @@ def test_at_its_moment_each_is_as_it_is_stored():
         torch.testing.assert_close(seen.opacities[at], moving.opacities[row])
 
 
-@pytest.mark.parametrize("time", [0.2, 0.5, 0.65])
+@pytest.mark.parametrize("time", [0.35, 0.5, 0.65])
 def test_paths_turns_and_fading_against_a_slow_loop(time: float):
     moving = some()
     seen = moving.at(time)
@@ -46,8 +47,9 @@ def test_paths_turns_and_fading_against_a_slow_loop(time: float):
     for row in range(len(moving)):
         since = time - float(moving.moments[row])
         path = since * moving.velocities[row] + since**2 / 2 * moving.accelerations[row]
+        path = path + since**3 / 6 * moving.jerks[row]
         torch.testing.assert_close(seen.means[row], moving.means[row] + path)
-        faded = math.exp(-0.5 * (since / 0.2) ** 2)
+        faded = math.exp(-0.5 * (since / 0.2) ** 4)
         torch.testing.assert_close(seen.opacities[row], moving.opacities[row] * faded)
         turned = rotation_exp(moving.turns[row] * since) @ rotation_from_quaternion(
             moving.quaternions[row]
@@ -74,6 +76,15 @@ def test_those_of_other_times_are_not_drawn():
     assert moving.at(0.9).means.shape == (0, 3)
 
 
+def test_for_most_of_its_span_each_stays_as_opaque():
+    moving = some()
+    opaque = [float(moving.at(0.3 + 0.2 * age).opacities[0]) for age in (0, 0.5, 1, 1.5, 1.85)]
+    full = float(moving.opacities[0].detach())
+    assert opaque[0] == pytest.approx(full) and opaque[1] > 0.96 * full
+    assert 0.6 * full < opaque[2] < 0.61 * full
+    assert opaque[3] < 0.09 * full and opaque[4] < 0.003 * full
+
+
 def test_still_and_moving_ones_are_drawn_together():
     moving = some()
     base = Gaussians.start(torch.zeros(2, 3), torch.zeros(2, 3), torch.full((2,), 0.5), degree=1)
@@ -87,7 +98,7 @@ def test_still_and_moving_ones_are_drawn_together():
 
 def test_gradients_of_everything_that_moves():
     moving = some(3).double()
-    names = ("means", "velocities", "accelerations", "turns", "moments", "log_spans")
+    names = ("means", "velocities", "accelerations", "jerks", "turns", "moments", "log_spans")
     rows = [getattr(moving, name).detach().clone().requires_grad_() for name in names]
 
     def at(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:

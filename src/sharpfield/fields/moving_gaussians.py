@@ -1,12 +1,14 @@
 """Gaussians that come, move and go: each lives around a moment of its own.
 
 At its *moment* a Gaussian is where its mean says and as opaque as it gets. Before and after, it has
-moved and turned at an even pace, the path bent by a constant acceleration, and it fades as
-exp(-d^2/2), d the time since then over its *span*. What stays in sight for longer is handed from
-one to the next, so that no motion is too long or too intricate to be followed.
+moved along a polynomial of the third degree and turned at an even pace. It stays as opaque for most
+of its *span* and then fades fast, as exp(-d^4/2), d the time since its moment in spans. What stays
+in sight for longer is handed from one to the next, so that no motion is too long or too intricate
+to be followed.
 
-Source: Li et al., "Spacetime Gaussian feature splatting" (CVPR 2024), with paths of the second
-degree, and colours that are stored instead of features.
+Source: Li et al., "Spacetime Gaussian feature splatting" (CVPR 2024), with colours that are stored
+instead of features, and without their slow fading as exp(-d^2/2), in which several Gaussians of
+different moments lie over each other and blur what they show.
 """
 
 import math
@@ -18,7 +20,7 @@ from torch import Tensor, nn
 
 from sharpfield.fields.gaussians import Gaussians
 
-FADED = 3.0
+FADED = 1.9
 """Spans after which a Gaussian has faded to nearly nothing and is not drawn."""
 
 
@@ -45,6 +47,8 @@ class MovingGaussians(Gaussians):
         self.log_spans = nn.Parameter(torch.full_like(self.moments, math.log(span)))
         self.velocities = nn.Parameter(still.clone())
         self.accelerations = nn.Parameter(still.clone())
+        self.jerks = nn.Parameter(still.clone())
+        """How fast accelerations change."""
         self.turns = nn.Parameter(still.clone())
         """Rotation vectors, for the time of the whole capture."""
 
@@ -59,13 +63,14 @@ class MovingGaussians(Gaussians):
         age = since / self.spans
         there = age.detach().abs() < FADED
         since, age = since[there, None], age[there]
-        path = self.velocities[there] + 0.5 * since * self.accelerations[there]
+        bend = self.accelerations[there] / 2 + since * self.jerks[there] / 6
+        path = self.velocities[there] + since * bend
         turned = product(half_turn(self.turns[there] * since), self.quaternions[there])
         return Passing(
             means=self.means[there] + since * path,
             quaternions=turned,
             scales=self.scales[there],
-            opacities=self.opacities[there] * torch.exp(-0.5 * age * age),
+            opacities=self.opacities[there] * torch.exp(-0.5 * age**4),
             gaussians=self,
             there=there,
         )

@@ -36,12 +36,15 @@ rate of its mean does."""
 class DynamicOptions:
     """The Gaussians of a moving scene, and how they may move."""
 
-    density: float = 1.5
-    """Gaussians for each pixel of a frame; half of them stand still, half move, at all times
-    together."""
+    density: float = 0.75
+    """Gaussians that stand still, for each pixel of a frame."""
+    density_moving: float = 2.25
+    """Gaussians that move, for each pixel of a frame, at all times together."""
+    area: int = 2
+    """Subpixels along each side of a pixel, which gathers light over its area."""
     degree: int = 0
     """Of the spherical harmonics of those that stand still."""
-    span_ms: float = 60.0
+    span_ms: float = 120.0
     """First span of moving ones, see `fields.moving_gaussians`."""
     size: float = 0.7
     """First scale of still ones, relative to the distance of their neighbours in an image."""
@@ -92,14 +95,18 @@ class DynamicScene(nn.Module):
         self.options, self.seed, self.tone = options, seed, tone
         self.still_until = still_until
         pixels = capture.camera.width * capture.camera.height
-        self.budget = max(round(options.density / 2 * pixels), LEAST)
+        still, moving = (
+            max(round(density * pixels), LEAST)
+            for density in (options.density, options.density_moving)
+        )
+        self.budgets = {"still": still, "moving": moving}
         self.span = options.span_ms * 1000 / capture.clock.span_us
-        count, opacity = self.budget, options.opacity
+        opacity = options.opacity
         self.still = still_start(
-            capture, tone, count, seed, degree=options.degree, size=options.size, opacity=opacity
+            capture, tone, still, seed, degree=options.degree, size=options.size, opacity=opacity
         )
         self.moving = moving_start(
-            capture, index, tone, count, seed, span=self.span, opacity=opacity
+            capture, index, tone, moving, seed, span=self.span, opacity=opacity
         )
         self.behind = nn.Parameter(usual_colour(capture, tone))
         self.splatting = Splatting(capture.camera, tone.decode)
@@ -114,10 +121,13 @@ class DynamicScene(nn.Module):
 
         Args:
             views: Those of the same moment are drawn together.
-            splatting: Of another camera than the capture's.
+            splatting: Of another camera than the capture's, each of whose pixels is drawn once.
             step: Of training; by default it is over.
         """
-        splatting = self.splatting if splatting is None else splatting
+        if splatting is None:
+            parts = self.options.area
+            fine = replace(self.splatting, camera=self.splatting.camera.scaled(float(parts)))
+            return averaged(self.draw(finer(views, parts), fine, step=step), parts)
         alone = step is not None and step < self.still_until
         return _beside(
             [self._moment(views[:, j : j + 1], splatting, alone) for j in range(views.shape[1])]
@@ -155,7 +165,7 @@ class DynamicScene(nn.Module):
                 part.means.add_(noise)
             if on:
                 growth = share_out(
-                    part.log_scales, part.opacity_logits, budget=self.budget, generator=made
+                    part.log_scales, part.opacity_logits, budget=self.budgets[name], generator=made
                 )
                 found += [] if growth is None else [(part, growth)]
         return found
@@ -172,6 +182,7 @@ class DynamicScene(nn.Module):
         paths = {
             "velocities": (own.velocities, scaled(self.means_rate, pace)),
             "accelerations": (own.accelerations, scaled(self.means_rate, pace / self.span)),
+            "jerks": (own.jerks, scaled(self.means_rate, pace / self.span**2)),
             "turns": (own.turns, constant(SLOWER * rates.quaternions / self.span)),
             "moments": (own.moments, scaled(self.means_rate, self.span)),
             "spans": (own.log_spans, constant(self.options.spans_rate)),
@@ -183,6 +194,22 @@ class DynamicScene(nn.Module):
     def _later(self, rate: Schedule) -> Schedule:
         """A rate, once moving ones are there."""
         return lambda step: rate(step) if step >= self.still_until else 0.0
+
+
+def finer(views: Views, parts: int) -> Views:
+    """The same views, with each pixel cut into parts along both sides."""
+    size = parts * views.size[0], parts * views.size[1]
+    return replace(views, corner=parts * views.corner, size=size)
+
+
+def averaged(light: Radiance, parts: int) -> Radiance:
+    """Means over pixels that were cut into parts."""
+
+    def mean(values: Tensor) -> Tensor:
+        cut = values.unflatten(2, (-1, parts)).unflatten(1, (-1, parts))
+        return cut.mean((2, 4))
+
+    return Radiance(mean(light.rgb), mean(light.depth), mean(light.opacity), mean(light.weight))
 
 
 def _always(rate: Schedule) -> Schedule:

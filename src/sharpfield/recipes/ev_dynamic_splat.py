@@ -1,6 +1,6 @@
 """Recipes on moving Gaussians: a moving scene from a rig of cameras, in minutes.
 
-What moves are Gaussians that come, follow a parabola and go; what stands still are others. Frames,
+What moves are Gaussians that come, follow a curve and go; what stands still are others. Frames,
 sharp or blurred, and events of any number of cameras say how: several cameras look at the same
 moments.
 """
@@ -28,7 +28,7 @@ LI = Paper(
 }""",
     departures=(
         "Gaussians have one colour each: there are no features that a network turns into colours.",
-        "Paths are parabolas instead of polynomials of degree three.",
+        "They are opaque for most of their time and then fade fast, exp(-d^4/2) for exp(-d^2/2).",
         "What stands still are Gaussians of their own, before an even background.",
         "Moving ones start in the hull of each moment, not at points of structure from motion.",
         "The loss is the mean absolute difference alone, without structural similarity.",

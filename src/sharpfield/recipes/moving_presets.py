@@ -78,7 +78,7 @@ def dynamic_standard(recipe: DynamicSplat) -> DynamicSplat:
     """More Gaussians, and more cameras and instants in each step; an hour on a processor."""
     return replace(
         recipe.lasting(20_000),
-        gaussians=replace(recipe.gaussians, density=3.0),
+        gaussians=replace(recipe.gaussians, density=1.5, density_moving=4.5),
         looks=replace(recipe.looks, cameras=4, instants=5),
     )
 
