@@ -10,7 +10,7 @@ from rich.console import Console
 from tyro.conf import Positional
 
 from sharpfield.captures.pose_file import read_poses
-from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.arguments import Device, End, Size, Start, parse_size
 from sharpfield.cli.event_output import (
     Tell,
     Wanted,
@@ -21,8 +21,8 @@ from sharpfield.cli.event_output import (
     telling,
     write_parts,
 )
-from sharpfield.cli.run_commands import Device
 from sharpfield.cli.runs import Opened, open_run
+from sharpfield.cli.screen import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
@@ -47,8 +47,6 @@ OWN_SIZE = "sensor"
 PIECE_MS = 10.0
 """Events are written whenever so much time was seen, where no windows are asked for."""
 
-Start = Annotated[float | None, tyro.conf.arg(name="from", metavar="MS")]
-End = Annotated[float | None, tyro.conf.arg(name="to", metavar="MS")]
 On = Annotated[float | None, tyro.conf.arg(name="on", metavar="MS")]
 
 
@@ -67,7 +65,7 @@ class Place:
     on_ms: On = None
     """Switched on already then, in silence, so that its pixels carry levels of their own; if
     nothing is said, when its events begin, or with a comparison as early as its path."""
-    size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
+    size: Size | None = None
     """Pixels of the sensor, or `sensor` for those of the one that is named; as recorded if nothing
     is said."""
 
@@ -146,7 +144,7 @@ def events(
     """
     expect_format(out)
     _expect_sense(place, extra)
-    console = Console()
+    console = screen()
     opened = open_run(run, capture=capture, device=device)
     whole = _seat(opened, place, pixels.sensor)
     seat = whole.between(*_ends(place))
@@ -168,9 +166,9 @@ def events(
         twin = EventTwin(light, seen, sensor, pace=pixels.pace(), seed=pixels.seed)
         made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
     say = f"{made.count:,} events, from {twin.looks} pictures, are in {out}"
-    console.print(say, highlight=False)
+    console.print(say)
     if wanted.frames is not None:
-        console.print(f"{len(edges)} event frames are in {wanted.frames}", highlight=False)
+        console.print(f"{len(edges)} event frames are in {wanted.frames}")
     if recorded is not None:
         about = {
             "threshold_on": sensor.threshold_on,
@@ -249,7 +247,6 @@ def _matched(
         f"Thresholds x {found.on:.3f} to brighter, x {found.off:.3f} to darker match "
         f"{found.recorded:,} recorded events outside the time rendered; without, the scene makes "
         f"{found.unmatched / found.recorded:.1%} of them",
-        highlight=False,
     )
     return matched
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from sharpfield.cli.screen import progress_on
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, merged
@@ -154,8 +155,8 @@ def compare(
     write_image(picture, side_by_side(*streams, edges_us))
     for name, value in found.items():
         shown = "-" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
-        console.print(f"  {name:<18} {shown}", highlight=False)
-    console.print(f"Recorded and rendered side by side: {picture}", highlight=False)
+        console.print(f"  {name:<18} {shown}")
+    console.print(f"Recorded and rendered side by side: {picture}")
 
 
 @contextmanager
@@ -168,8 +169,7 @@ def telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, 
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    quiet = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=quiet) as progress:
+    with progress_on(console, *columns) as progress:
         task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
 
         def look(done: int, pixels: int) -> None:
