@@ -1,6 +1,10 @@
 """The commands as a user types them: what they write, what they print, how they refuse."""
 
+import csv
 import json
+import os
+import signal
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +142,34 @@ def test_render_makes_a_film_and_pictures(trained: Path, tmp_path: Path) -> None
     words = ("--path", "exposure:1", "--pictures", 2)
     assert run("render", trained, "--out", tmp_path / "inside", *words) == 0
     assert len(list((tmp_path / "inside").glob("*.png"))) == 2
+
+
+def test_held_out_views_are_scored_while_training(
+    recorded: Path, trained: Path, tmp_path: Path
+) -> None:
+    """Which changes nothing that is learned."""
+    words = ("--preset", "draft", "--steps", 4, *SMALL, "--validate-every", 2)
+    assert run("train", "ev-deblur-nerf", recorded, "--out", tmp_path / "run", *words) == 0
+    with (tmp_path / "run" / "log.csv").open() as log:
+        scores = {row["step"]: row["validation"] for row in csv.DictReader(log)}
+    assert run("evaluate", tmp_path / "run") == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert float(scores["4"]) == pytest.approx(metrics["mean"]["psnr"], abs=1e-3)
+    assert float(scores["2"]) > 0
+    last = Path("checkpoints") / "last.safetensors"
+    assert (tmp_path / "run" / last).read_bytes() == (trained / last).read_bytes()
+    assert (tmp_path / "run" / "checkpoints" / "best.safetensors").is_file()
+
+
+def test_an_interrupted_training_says_so_to_what_would_follow(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(import_module("sharpfield.training.train"), "fit", interrupted)
+    words = ("--preset", "draft", "--steps", 4, *SMALL)
+    assert run("train", "ev-deblur-nerf", recorded, "--out", tmp_path / "run", *words) == 130
 
 
 def test_resuming_equals_never_having_stopped(recorded: Path, trained: Path) -> None:

@@ -14,7 +14,7 @@ from sharpfield.cli.screen import progress_on
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation import Measuring, Story, evaluate, write_report
+from sharpfield.evaluation import Measuring, Story, evaluate, validation, write_report
 from sharpfield.recipes.saved import Started, read_started, write_started
 from sharpfield.training import (
     Ledger,
@@ -121,7 +121,8 @@ def start(
     console: Console,
 ) -> Ledger:
     """Train a recipe on a capture in a run folder, or go on with it."""
-    chosen = used(part_of(capture, started.block), started.use)
+    part = part_of(capture, started.block)
+    chosen = used(part, started.use)
 
     def build(steps: int) -> Model:
         return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
@@ -135,6 +136,7 @@ def start(
         options,
         steps=started.recipe.steps,
         settings=started.settings(),
+        validate=validation(part),
         console=console,
     )
 

@@ -13,10 +13,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -24,19 +22,18 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.brightness import Brightness, fit_brightness
-from sharpfield.evaluation.device import device_of
+from sharpfield.evaluation.brightness import Brightness
 from sharpfield.evaluation.event_films import event_films
 from sharpfield.evaluation.event_scores import event_scores
 from sharpfield.evaluation.more_scores import aligned_psnr, depth_error, distances
 from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
-from sharpfield.evaluation.reference import Reference, held_out, trained_on
+from sharpfield.evaluation.reference import held_out, trained_on
 from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
-from sharpfield.geometry.rolling import Rolling, moved_rows
+from sharpfield.evaluation.views import View, brightness_of, seen_at
 from sharpfield.metrics import Lpips, laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX
-from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, render_view, renderer_of
+from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, renderer_of
 from sharpfield.storage.images import write_image
 
 METRICS = "metrics.json"
@@ -61,18 +58,6 @@ class Measuring:
     """Whether the model knows no absolute brightness; None: if its capture has no frames."""
     stated: Mapping[str, Any] = field(default_factory=dict)
     """What the caller knows about the protocol: pose refinement, near-plane removal, ..."""
-
-
-@dataclass(frozen=True)
-class View:
-    """A render beside what it should look like."""
-
-    reference: Reference
-    light: Float[Tensor, "h w c"]
-    """Linear, as the model gives it."""
-    depth: Float[Tensor, "h w"]
-    opacity: Float[Tensor, "h w"]
-    seconds: float
 
 
 def evaluate(
@@ -106,10 +91,21 @@ def evaluate(
     _same_size(model, capture)
     test, train = held_out(capture), trained_on(capture, limit=how.train_views)
     shown = _Shown(progress, len(test) + len(train), model.capture.camera.size)
-    test_views = [_render(model, reference, capture, how, shown) for reference in test]
-    train_views = [_render(model, reference, capture, how, shown) for reference in train]
-
-    brightness = _brightness(model, test_views or train_views, how)
+    test_views, train_views = (
+        [
+            seen_at(
+                model,
+                reference,
+                capture,
+                pose=how.poses.get(reference.frame),
+                chunk=how.chunk,
+                progress=shown.within,
+            )
+            for reference in references
+        ]
+        for references in (test, train)
+    )
+    brightness = brightness_of(model, test_views or train_views, blind=how.events_only)
     lpips = how.lpips if _large_enough(how.lpips, capture) else None
     tested = [_judge(view, brightness, lpips, run / "renders" / "test") for view in test_views]
     learned = [_judge(view, brightness, lpips, run / "renders" / "train") for view in train_views]
@@ -147,56 +143,6 @@ class _Shown:
         if self.progress is not None:
             self.progress(self.before + done, self.total)
         self.before += self.pixels if done == self.pixels else 0
-
-
-def _render(
-    model: Model, reference: Reference, capture: Capture, how: Measuring, shown: _Shown
-) -> View:
-    frames, own = capture.needed_frames, model.capture
-    time = float(own.clock.unit(frames.exposure.middle_us)[reference.frame])
-    home, track = device_of(own.trajectory), int(frames.track[reference.frame])
-    when = torch.tensor(time, device=home), torch.tensor(track, device=home)
-    shutter = Rolling.of(capture, along=own.trajectory)
-    with torch.no_grad():
-        start = shutter.pose(*when)
-        pose = how.poses.get(reference.frame, start).to(device_of(model))
-        rows = moved_rows(shutter.rows(*when), start, pose)
-    begun = perf_counter()
-    seen = render_view(
-        renderer_of(model),
-        own.camera,
-        pose,
-        time,
-        rows=rows,
-        chunk=how.chunk,
-        progress=shown.within,
-    )
-    if not seen.rgb.isfinite().all():
-        raise RunError(
-            "the model renders colours that are not finite numbers",
-            where=f"frame {reference.name}",
-            got=f"{int((~seen.rgb.isfinite()).sum())} of {seen.rgb.numel()} values",
-            do="train again, or evaluate an earlier checkpoint",
-        )
-    return View(reference, seen.rgb, seen.depth, seen.opacity, perf_counter() - begun)
-
-
-def _brightness(model: Model, views: list[View], how: Measuring) -> Brightness:
-    """As the model develops light; for a model of events alone, aligned to the references."""
-    home = device_of(model)
-
-    @torch.no_grad()
-    def develop(light: Tensor) -> Tensor:
-        return model.develop(light.to(home)).cpu()
-
-    events = model.capture.events
-    blind = model.capture.frames is None if how.events_only is None else how.events_only
-    if not blind or events is None:
-        return Brightness(develop)
-    compared = [
-        (view.light, view.reference.image) for view in views if view.reference.image is not None
-    ]
-    return fit_brightness(develop, compared, grey=not events.coloured)
 
 
 def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path) -> dict[str, Any]:

@@ -52,6 +52,7 @@ def train(
 
     Raises:
         RunError: The folder holds another run, or a loss is not finite.
+        KeyboardInterrupt: A signal came; everything is saved, and whatever was to follow is not.
     """
     console = console or Console()
     with Stop(minutes=options.minutes) as stop:
@@ -88,6 +89,8 @@ def train(
             highlight=False,
             soft_wrap=True,
         )
+    if stop.interrupted:
+        raise KeyboardInterrupt
     return record.ledger
 
 
