@@ -108,36 +108,25 @@ def test_frames_are_as_stored(tiny: Capture):
         assert look.time.item() == pytest.approx(float(middle), abs=1e-6)
 
 
-def gamma(light: np.ndarray) -> np.ndarray:
-    return light ** (1 / 2.2)
-
-
-@pytest.mark.parametrize("events", [False, True], ids=["frames", "one beside"])
-def test_a_frame_is_the_light_of_its_sharp_pictures_at_the_instants_drawn(events: bool):
-    """What lies beside the exposure has no part in it."""
-    batch = looks(busy(), instants=3).exposure(4, events=events, belief=BELIEF)
-    frames, sharp, look = batch["frames"], batch["sharp"], batch["look"]
-    assert isinstance(frames, Pixels) and isinstance(sharp, Pixels) and isinstance(look, Instants)
-    inside = look.weight[0] > 0
-    assert int(inside.sum()) == 3 and len(inside) == 3 + events
-    pictures = sharp.value[0][:, :, inside].numpy().astype(np.float64)  # [h, w, k, c]
-    wanted = gamma((pictures**2.2).mean(2))
-    np.testing.assert_allclose(frames.value[0].numpy(), wanted, atol=1e-5)
-
-
-def test_of_many_instants_it_is_the_frame_that_was_recorded():
-    capture = busy()
-    stored = capture.needed_frames.images / np.float32(255)
-    off = []
-    for instants in (2, 40):
-        seen = looks(capture, instants=instants).exposure(
-            4, events=False, belief=Belief(0.02, 0.02)
-        )
-        frames = seen["frames"]
+def test_views_that_are_only_drawn_fill_the_exposure(tiny: Capture):
+    """Together with those that teach, each has a share of it of its own, and they count alike."""
+    made, taken = looks(tiny, instants=2, draws=3), set()
+    for step in range(12):
+        batch = made.exposure(step, events=False, belief=BELIEF)
+        look, rest, frames = batch["look"], batch["rest"], batch["frames"]
+        assert isinstance(look, Instants) and isinstance(rest, Instants)
         assert isinstance(frames, Pixels)
-        recorded = stored[int(frames.frame[0, 0, 0])]
-        off.append(float(np.abs(frames.value[0].numpy() - recorded).mean()))
-    assert off[1] < 0.004 and off[1] < 0.5 * off[0]
+        opens, closes = frames.open.unique(), frames.close.unique()
+        learned, drawn = (
+            (6 * (seen.time[0] - opens) / (closes - opens) + 1e-3).floor().int().tolist()
+            for seen in (look, rest)
+        )
+        assert sorted(learned + drawn) == list(range(6))
+        assert learned[0] < 3 <= learned[1]
+        taken.update(learned)
+        assert look.weight.tolist() == [[0.5] * 2]
+        assert rest.weight.numpy() == pytest.approx(np.full((1, 4), 1 / 6))
+    assert taken == set(range(6)), "each teaches at some time"
 
 
 def phase(capture: Capture, x: int, y: int, t_us: int) -> float | None:

@@ -9,7 +9,19 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Camera, Capture, CaptureError, Growing, Model, OptionError, Rays
+from sharpfield.core import (
+    Camera,
+    Capture,
+    CaptureError,
+    Growing,
+    Instants,
+    Model,
+    OptionError,
+    Pixels,
+    Rays,
+)
+from sharpfield.core.views import Views
+from sharpfield.formation.mix import mix
 from sharpfield.geometry import Still
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.recipes import RECIPES, recipe_named
@@ -64,14 +76,15 @@ def small(name: str, **changes: Any) -> Any:
 
 def learned(model: SplatModel) -> tuple[float, float]:
     """The loss of the last steps' looks, before and after training."""
-    probe = [(step, model.draw(step)) for step in range(STEPS - 4, STEPS)]
+    steps = model.recipe.steps
+    probe = [(step, model.draw(step)) for step in range(steps - 4, steps)]
 
     @torch.no_grad()
     def loss() -> float:
         return sum(float(sum(model.losses(batch, step).values())) for step, batch in probe)
 
     before = loss()
-    fit(model, adam(model), steps=range(STEPS))
+    fit(model, adam(model), steps=range(steps))
     return before, loss()
 
 
@@ -125,9 +138,40 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> Non
     assert model.late_from == model.heaviest_step == STEPS // 2
     early, late = model.draw(STEPS // 2 - 1), model.draw(STEPS // 2)
     assert set(early) == {"look", "sharp"} and len(early["look"].time[0]) == 1
-    assert set(late) == {"look", "frames", "sharp", "events"} and len(late["look"].time[0]) == 4
+    assert set(late) == {"look", "rest", "frames", "sharp", "events"}
+    assert len(late["look"].time[0]) == 4 and len(late["rest"].time[0]) == 6
     terms = model.losses(late, STEPS // 2)
     assert set(terms) == {"blur", "sharp", "events", "idle"}
+    assert "idle" not in model.losses(late, STEPS - 1), "growing has ended"
+
+
+def test_a_blurred_frame_is_the_mean_of_all_views_with_the_gradient_of_a_few() -> None:
+    """Of few views, the error would be that of a frame which was exposed at those few instants."""
+    looks = LookOptions(instants=2, draws=4, early=0.0, sharp=0.0, windows=0.0)
+    model = small("ev-splat", looks=looks).build(recorded(), 0)
+    batch = model.draw(0)
+    look, rest, frames = batch["look"], batch["rest"], batch["frames"]
+    assert isinstance(look, Instants) and isinstance(rest, Instants) and isinstance(frames, Pixels)
+
+    def mean(*looks: Instants) -> torch.Tensor:
+        time = torch.cat([look.time for look in looks], 1)
+        pose = model.shutter.pose(time, torch.zeros_like(time, dtype=torch.int64))
+        corner = torch.zeros(*time.shape, 2, dtype=torch.int64)
+        weight = torch.full_like(time, 1 / time.shape[1])
+        return mix(model.scene.draw(Views(pose, time, weight, corner, look.size)))
+
+    whole = mean(look, rest).detach().requires_grad_()
+    wanted = (model.tone.encode(whole) - frames.value).abs().mean()
+    blur = model.losses(batch, 0)["blur"]
+    torch.testing.assert_close(blur, wanted)
+
+    colours = model.scene.gaussians.base_harmonics
+    pull = (mean(look) * torch.autograd.grad(wanted, whole)[0]).sum()
+    for one, other in zip(
+        torch.autograd.grad(blur, colours), torch.autograd.grad(pull, colours), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+        assert one.any()
 
 
 def test_the_baselines_differ_in_what_they_believe_of_the_frames() -> None:
@@ -228,7 +272,7 @@ def test_a_rolling_shutter_is_better_modelled_than_not() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_recipe_learns_through_a_rolling_shutter(name: str) -> None:
-    before, after = learned(small(name).build(rolled(), 0))
+    before, after = learned(replace(small(name), steps=2 * STEPS).build(rolled(), 0))
     assert after < 0.9 * before
 
 

@@ -6,12 +6,12 @@ counted at every pixel between two instants that follow each other. A look at a 
 costs less.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from torch import Tensor
 
 from sharpfield.captures import event_index
@@ -45,15 +45,17 @@ class LookOptions:
     """Frames are taken as sharp, or as the mean of light along the motion of the camera: the
     capture's own, or one learned for each frame where it is not known."""
     instants: int = 3
-    """Views of an exposure."""
+    """Views of an exposure through which the scene learns."""
+    draws: int = 3
+    """Views drawn for each of those: light adds up over many, a gradient can do with few."""
     early: float = 0.6
     """Part of the schedule that looks at single instants, if events can make sharp pictures."""
     still: float = 0.0
     """Part of the schedule that takes frames as if they were sharp: a view instead of several."""
-    sharp: float = 0.2
+    sharp: float = 0.05
     """Weight of the sharp pictures from events in late steps; in early ones it is 1. 0 leaves them
     out altogether."""
-    windows: float = 0.002
+    windows: float = 0.03
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
     shortest_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
@@ -134,10 +136,12 @@ class Looks:
         frame = self._frame(step)
         opens, closes = frames.exposure.window(frame)
         moved = self.options.blur == "motion" and opens < closes and not still
-        count = self.options.instants if moved else 1
+        learned, draws = (self.options.instants, self.options.draws) if moved else (1, 1)
+        count = learned * draws
         place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
-        times = np.rint(opens + (closes - opens) * place).astype(np.int64)
-        weight = np.full(count, 1 / count)
+        places = np.rint(opens + (closes - opens) * place).astype(np.int64)
+        chosen = np.arange(learned) * draws + random.integers(draws, size=learned)
+        times, weight = places[chosen], np.full(learned, 1 / learned)
         windows = events and self.motion is not None and self.options.windows > 0
         if windows:
             times, weight = self._with_one_beside(times, weight, (opens, closes), random)
@@ -145,29 +149,17 @@ class Looks:
             "look": self._instants(times, weight, frame, part),
             "frames": self._frame_pixels(frame, part),
         }
+        if draws > 1:
+            rest = np.delete(places, chosen)
+            batch["rest"] = self._instants(rest, np.full(len(rest), 1 / count), frame, part)
         if self.sharp is not None:
-            sharp = batch["sharp"] = self._sharp(times, frame, part, belief)
-            batch["frames"] = replace(batch["frames"], value=self._as_sampled(sharp.value, weight))
+            batch["sharp"] = self._sharp(times, frame, part, belief)
         if windows:
             batch["events"] = self._windows(times, part)
         if self.depth is not None:
             middle = np.abs(times - (opens + closes) / 2) + (weight == 0) * (closes - opens + 1)
             batch["depth"] = self._depth(frame, int(np.argmin(middle)), part)
         return batch
-
-    def _as_sampled(
-        self, stored: Float[Tensor, "m h w k c"], weight: np.ndarray
-    ) -> Float[Tensor, "m h w c"]:
-        """The blurred frame as so few instants would have averaged it.
-
-        A mean of a few views is not the mean over the exposure. If it had to equal the blurred
-        frame whatever the instants, a scene that is itself a little blurred would do best. The
-        sharp pictures at the same instants are the frame times how its light moved, so that their
-        mean is the frame but for that difference, in colours that are the frame's own.
-        """
-        assert self.sharp is not None
-        light = self.sharp.tone.decode(stored) * torch.from_numpy(weight).float()[:, None]
-        return self.sharp.tone.encode(light.sum(-2))
 
     def stretch(self, step: int) -> Batch:
         """A stretch of events of any length, cut into windows."""

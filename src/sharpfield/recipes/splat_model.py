@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.camera import Camera
@@ -143,20 +144,14 @@ class SplatModel(nn.Module):
         assert isinstance(look := batch["look"], Instants)
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
         only_events = events is not None and frames is None
-        time = self.unknowns.on_time(look.time) if only_events else look.time
-        light = self.scene.draw(
-            Views(
-                *(self.shutter.pose(time, look.track), time, look.weight, look.corner, look.size),
-                rows=self.shutter.rows(time, look.track),
-            )
-        )
-        terms = self.scene.idleness()
+        light = self._drawn(look, self.unknowns.on_time(look.time) if only_events else look.time)
+        terms = self.scene.idleness(step)
         if isinstance(frames, Pixels):
-            exposed = replace(light, rgb=self._exposed(light.rgb, frames))
-            terms["blur"] = (mix(exposed, outer=self.tone.encode) - frames.value).abs().mean()
+            blurred = self._exposed(self._mean(light, batch.get("rest")), frames.frame[:, 0, 0])
+            terms["blur"] = (self.tone.encode(blurred) - frames.value).abs().mean()
         if isinstance(sharp, Pixels):
             weight = 1.0 if step < self.late_from else self.options.sharp
-            stored = self.tone.encode(self._exposed(light.rgb, sharp[..., 0]))
+            stored = self.tone.encode(self._exposed(light.rgb, sharp.frame[:, 0, 0, 0]))
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(depth := batch.get("depth"), Depths):
             drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
@@ -167,11 +162,34 @@ class SplatModel(nn.Module):
             terms["prior"] = prior
         return terms
 
-    def _exposed(self, light: Float[Tensor, "m h w k c"], seen: Pixels) -> Tensor:
+    def _drawn(self, look: Instants, time: Float[Tensor, "m k"]) -> Radiance:
+        """The views of some looks, as if they were taken at a time."""
+        return self.scene.draw(
+            Views(
+                *(self.shutter.pose(time, look.track), time, look.weight, look.corner, look.size),
+                rows=self.shutter.rows(time, look.track),
+            )
+        )
+
+    def _mean(self, light: Radiance, rest: object) -> Float[Tensor, "m h w c"]:
+        """The mean light over an exposure, with the gradient of the mean of a few of its views.
+
+        A mean of few views is not that over the exposure: if it had to equal the blurred frame
+        whatever the instants, a scene that is itself a little blurred would do best.
+        """
+        few = mix(light)
+        if not isinstance(rest, Instants):
+            return few
+        with torch.no_grad():
+            share = 1 - rest.weight.sum(-1)[:, None, None, None]
+            missing = mix(self._drawn(rest, rest.time)) + share * few - few
+        return few + missing
+
+    def _exposed(self, light: Float[Tensor, "m *b c"], frame: Int64[Tensor, "m"]) -> Tensor:
+        """Light as bright as each frame was exposed."""
         if self.unknowns.log_gain is None:
             return light
-        gain = self.unknowns.log_gain[seen.frame[:, 0, 0]].exp()
-        return light * gain[:, None, None, None, None]
+        return light * self.unknowns.log_gain[frame].exp().reshape(-1, *[1] * (light.ndim - 1))
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""

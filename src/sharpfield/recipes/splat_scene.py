@@ -11,7 +11,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.growth import Growth
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
-from sharpfield.core.schedule import Group, Schedule, constant, exponential
+from sharpfield.core.schedule import Group, Schedule, constant, exponential, scaled
 from sharpfield.core.seed import generator
 from sharpfield.core.views import Views
 from sharpfield.fields import Gaussians
@@ -30,6 +30,11 @@ EXTENT = 2.0
 
 LEAST = 2000
 """Gaussians of a scene that sizes itself by its frames."""
+
+SETTLED = 0.05
+"""What is left of a rate at the end of the schedule, relative to where growing ended."""
+
+STEADY = constant(1.0)
 
 SHEEN_SLOWER = 5
 """How much slower colours learn what changes with the direction."""
@@ -69,7 +74,8 @@ class GaussianOptions:
     grow_every: int = 100
     """Steps between two rounds of growing."""
     grow_until: float = 0.85
-    """Part of the schedule after which their number and places in line stay."""
+    """Part of the schedule after which their number and places in line stay, nothing shakes or
+    frees them any more, and all rates fall so that they come to rest."""
     idle: float = 0.01
     """Weight of mean opacity and of mean scale, with `markov`."""
     noise: float = 5e4
@@ -114,6 +120,7 @@ class SplatScene(nn.Module):
         self.last_growth = int(options.grow_until * steps)
         rates = options.rates
         self.means_rate = exponential(rates.means, rates.means / 100, until=max(steps, 1))
+        self.settling = settling(self.last_growth, steps)
         self.noticed: tuple[Tensor, tuple[int, int]] | None = None
 
     def draw(self, views: Views) -> Radiance:
@@ -125,9 +132,10 @@ class SplatScene(nn.Module):
             self.noticed = shift, views.size
         return self.splatting(self.gaussians, views, shift)
 
-    def idleness(self) -> Terms:
-        """What frees Gaussians of little use."""
-        if self.options.growth != "markov" or self.options.idle == 0:
+    def idleness(self, step: int) -> Terms:
+        """What frees Gaussians of little use, as long as they may move to better places."""
+        markov = self.options.growth == "markov"
+        if not markov or self.options.idle == 0 or step >= self.last_growth:
             return {}
         return {"idle": self.options.idle * torch.stack(idleness(self.gaussians)).sum()}
 
@@ -141,9 +149,12 @@ class SplatScene(nn.Module):
 
     def groups(self) -> list[Group]:
         """Parameters with their rates."""
-        return gaussian_groups(self.gaussians, self.options.rates, self.means_rate)
+        rates = self.options.rates
+        return gaussian_groups(self.gaussians, rates, self.means_rate, self.settling)
 
     def _share_out(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
+        if step >= self.last_growth:
+            return []
         own, options = self.gaussians, self.options
         made = generator(self.seed, step, "growth", own.means.device)
         if options.noise > 0:
@@ -180,14 +191,23 @@ def budget_of(options: GaussianOptions, capture: Capture) -> int:
     return options.budget or max(round(width * height * options.density), LEAST)
 
 
-def gaussian_groups(own: Gaussians, rates: Rates, means_rate: Schedule) -> list[Group]:
-    """Parameters of Gaussians with their rates; means have a schedule, the rest keep theirs."""
+def settling(begin: int, steps: int) -> Schedule:
+    """1, and from a step on down to a twentieth at the end."""
+    if begin >= steps:
+        return constant(1.0)
+    return exponential(1.0, SETTLED, begin=begin, until=steps)
+
+
+def gaussian_groups(
+    own: Gaussians, rates: Rates, means_rate: Schedule, settle: Schedule = STEADY
+) -> list[Group]:
+    """Parameters of Gaussians with their rates, all of which fall as `settle` does."""
     named = {
-        "means": (own.means, means_rate),
-        "quaternions": (own.quaternions, constant(rates.quaternions)),
-        "scales": (own.log_scales, constant(rates.log_scales)),
-        "opacities": (own.opacity_logits, constant(rates.opacities)),
-        "colours": (own.base_harmonics, constant(rates.colours)),
-        "sheen": (own.higher_harmonics, constant(rates.colours / SHEEN_SLOWER)),
+        "means": (own.means, lambda step: means_rate(step) * settle(step)),
+        "quaternions": (own.quaternions, scaled(settle, rates.quaternions)),
+        "scales": (own.log_scales, scaled(settle, rates.log_scales)),
+        "opacities": (own.opacity_logits, scaled(settle, rates.opacities)),
+        "colours": (own.base_harmonics, scaled(settle, rates.colours)),
+        "sheen": (own.higher_harmonics, scaled(settle, rates.colours / SHEEN_SLOWER)),
     }
     return [Group(name, (parameter,), rate) for name, (parameter, rate) in named.items()]
