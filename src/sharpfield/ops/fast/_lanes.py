@@ -137,58 +137,38 @@ def total(typing, row):
     return row.element(row), generate
 
 
-@instruction
-def _add(typing, one, other):
-    def generate(context, builder, signature, arguments):
-        return builder.fadd(*arguments, flags=CONTRACT)
+def _of_two(operation, **options):
+    """The instruction that combines two rows by an operation of llvmlite's builder."""
 
-    return one(one, other), generate
+    def define(typing, one, other):
+        def generate(context, builder, signature, arguments):
+            return getattr(builder, operation)(*arguments, **options)
 
+        return one(one, other), generate
 
-@instruction
-def _subtract(typing, one, other):
-    def generate(context, builder, signature, arguments):
-        return builder.fsub(*arguments, flags=CONTRACT)
-
-    return one(one, other), generate
+    return instruction(define)
 
 
-@instruction
-def _multiply(typing, one, other):
-    def generate(context, builder, signature, arguments):
-        return builder.fmul(*arguments, flags=CONTRACT)
+_add = _of_two("fadd", flags=CONTRACT)
+_subtract = _of_two("fsub", flags=CONTRACT)
+_multiply = _of_two("fmul", flags=CONTRACT)
+_divide = _of_two("fdiv")
 
-    return one(one, other), generate
+
+def _everywhere(builder, number, width):
+    """A number as a row of itself."""
+    kind = ir.VectorType(number.type, width)
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), number, INT32(0))
+    return builder.shuffle_vector(first, first, _indices([0] * width))
 
 
 @instruction
 def _scale(typing, row, factor):
     def generate(context, builder, signature, arguments):
-        vector, factor = arguments
-        kind = vector.type
-        empty = ir.Constant(kind, ir.Undefined)
-        first = builder.insert_element(empty, factor, INT32(0))
-        everywhere = ir.Constant(ir.VectorType(INT32, kind.count), [0] * kind.count)
-        return builder.fmul(
-            vector, builder.shuffle_vector(first, empty, everywhere), flags=CONTRACT
-        )
+        factors = _everywhere(builder, arguments[1], row.width)
+        return builder.fmul(arguments[0], factors, flags=CONTRACT)
 
     return row(row, row.element), generate
-
-
-@instruction
-def _divide(typing, one, other):
-    def generate(context, builder, signature, arguments):
-        return builder.fdiv(*arguments)
-
-    return one(one, other), generate
-
-
-def _everywhere(builder, factor, width):
-    """A number as a row of itself."""
-    kind = ir.VectorType(factor.type, width)
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), factor, INT32(0))
-    return builder.shuffle_vector(first, first, _indices([0] * width))
 
 
 @instruction
@@ -225,28 +205,25 @@ def at_most(typing, row, limit):
     return row(row, row.element), generate
 
 
-@instruction
-def where_least(typing, row, tested, limit):
-    """The row, but zero where `tested` is less than a limit."""
+def _where(comparison):
+    """The instruction that keeps numbers of a row where another row compares so with a limit."""
 
-    def generate(context, builder, signature, arguments):
-        limit = _everywhere(builder, arguments[2], row.width)
-        enough = builder.fcmp_ordered(">=", arguments[1], limit)
-        return builder.select(enough, arguments[0], ir.Constant(limit.type, None))
+    def define(typing, row, tested, limit):
+        def generate(context, builder, signature, arguments):
+            limit = _everywhere(builder, arguments[2], row.width)
+            kept = builder.fcmp_ordered(comparison, arguments[1], limit)
+            return builder.select(kept, arguments[0], ir.Constant(limit.type, None))
 
-    return row(row, tested, row.element), generate
+        return row(row, tested, row.element), generate
+
+    return instruction(define)
 
 
-@instruction
-def where_below(typing, row, tested, limit):
-    """The row, but zero where `tested` reaches a limit."""
+where_least = _where(">=")
+"""The row, but zero where `tested` is less than a limit."""
 
-    def generate(context, builder, signature, arguments):
-        limit = _everywhere(builder, arguments[2], row.width)
-        enough = builder.fcmp_ordered("<", arguments[1], limit)
-        return builder.select(enough, arguments[0], ir.Constant(limit.type, None))
-
-    return row(row, tested, row.element), generate
+where_below = _where("<")
+"""The row, but zero where `tested` reaches a limit."""
 
 
 EXPONENTIAL = (
