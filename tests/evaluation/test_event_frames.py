@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from sharpfield.evaluation.event_frames import (
     signed,
     windows,
     without_few,
-    write_frames,
+    writing_frames,
 )
 from sharpfield.storage.images import read_image
 from tests.evaluation.fake import random_events
@@ -17,6 +19,12 @@ from tests.evaluation.fake import random_events
 def frames_of(events: EventStream, edges: list[int]) -> list[np.ndarray]:
     pairs = zip([0, *edges[:-1]], edges, strict=True)
     return [count_events(events.window(*pair)) for pair in pairs]
+
+
+def write_frames(folder: Path, counts: list[np.ndarray], *, least_share: float = 0.0) -> None:
+    with writing_frames(folder, len(counts), least_share=least_share) as append:
+        for part in counts:
+            append(part)
 
 
 def test_frames_of_windows_add_up_to_the_stream():

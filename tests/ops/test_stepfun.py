@@ -80,17 +80,6 @@ def test_stratified_positions_have_one_in_each_bin() -> None:
     assert torch.equal((found * 7).long(), torch.arange(7).expand(100, 7))
 
 
-def test_new_intervals_ascend_inside_the_old_range_around_their_centres() -> None:
-    edges, weights = ray()
-    position = stepfun.stratified_positions([4], 6, generator(3, 0, "u")).double()
-    found = stepfun.resample_intervals(edges, weights, position)
-    centre = stepfun.invert(edges, weights + stepfun.FLOOR, position)
-    assert found.shape == (4, 7) and (found.diff(dim=-1) > 0).all()
-    assert (found[:, 0] >= edges[:, 0]).all() and (found[:, -1] <= edges[:, -1]).all()
-    assert ((centre > found[:, :-1]) & (centre < found[:, 1:])).all()
-    torch.testing.assert_close(found[:, 1:-1], (centre[:, 1:] + centre[:, :-1]) / 2)
-
-
 def test_merge_sorts_and_tells_where_each_came_from() -> None:
     first, second = torch.tensor([[0.0, 2.0, 4.0]]), torch.tensor([[3.0, 2.0]])
     depth, order = stepfun.merge(first, second)
@@ -99,44 +88,11 @@ def test_merge_sorts_and_tells_where_each_came_from() -> None:
     assert torch.equal(stepfun.take_along(value, order)[..., 0], depth)
 
 
-def slow_distortion(edges: np.ndarray, weights: np.ndarray) -> float:
-    middle = (edges[1:] + edges[:-1]) / 2
-    total = 0.0
-    for i in range(len(weights)):
-        for j in range(len(weights)):
-            total += weights[i] * weights[j] * abs(middle[i] - middle[j])
-        total += weights[i] ** 2 * (edges[i + 1] - edges[i]) / 3
-    return total
-
-
-def test_distortion_matches_the_double_sum() -> None:
-    edges, weights = ray()
-    found = stepfun.distortion(edges, weights)
-    expected = [slow_distortion(e.numpy(), w.numpy()) for e, w in zip(edges, weights, strict=True)]
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-def test_distortion_does_not_change_when_an_interval_is_cut() -> None:
-    edges = torch.tensor([0.0, 0.3, 1.0], dtype=torch.float64)
-    weights = torch.tensor([0.4, 0.6], dtype=torch.float64)
-    cut_edges = torch.tensor([0.0, 0.3, 0.65, 1.0], dtype=torch.float64)
-    cut_weights = torch.tensor([0.4, 0.3, 0.3], dtype=torch.float64)
-    torch.testing.assert_close(
-        stepfun.distortion(edges, weights), stepfun.distortion(cut_edges, cut_weights)
-    )
-
-
-def test_distortion_gradient() -> None:
-    edges, weights = ray(samples=5, rays=2)
-    assert torch.autograd.gradcheck(stepfun.distortion, (edges, weights.requires_grad_()))
-
-
 def test_new_samples_carry_no_gradient() -> None:
     edges, weights = ray()
     weights.requires_grad_()
     position = stepfun.even_positions([4], 5).double()
     assert not stepfun.resample_points(edges[:, 1:], weights, position).requires_grad
-    assert not stepfun.resample_intervals(edges, weights, position).requires_grad
 
 
 def test_all_weight_at_the_ends_still_samples_inside_the_range() -> None:

@@ -11,7 +11,7 @@ Source: EvDNeRF (WACV 2024), whose figures leave out pixels with few events (`wi
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import ceil, floor
 from pathlib import Path
@@ -71,15 +71,6 @@ def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
     if length_us < 1:
         raise OptionError("windows must have a length", got=f"{length_us} us")
     return [*range(start_us + length_us, end_us, length_us), end_us]
-
-
-def write_frames(
-    folder: Path, counts: Sequence[Int32[np.ndarray, "h w 2"]], *, least_share: float = 0.0
-) -> None:
-    """Write a folder of event frames that are there already; see `writing_frames`."""
-    with writing_frames(folder, len(counts), least_share=least_share) as append:
-        for part in counts:
-            append(part)
 
 
 @contextmanager

@@ -27,14 +27,6 @@ def smoothness(
     return SMOOTHNESS * torch.stack(terms).sum()
 
 
-def roughness(cells: Float[Tensor, "d h w c"]) -> Float[Tensor, ""]:
-    """Total variation of a voxel grid along its three axes.
-
-    Source: Plenoxels (CVPR 2022), which takes the root of the squares; theirs is sampled.
-    """
-    return total_variation(cells)
-
-
 def alignment(
     offset_px: Float[Tensor, "b k 2"],
     origin: Float[Tensor, "b k 2"],

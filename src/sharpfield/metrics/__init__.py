@@ -1,7 +1,7 @@
 """Numbers to report, never to train on."""
 
 from sharpfield.metrics.event_blur import event_blur
-from sharpfield.metrics.events import count_error, relative_count_error
+from sharpfield.metrics.events import relative_count_error
 from sharpfield.metrics.image import psnr, ssim, ssim_paper, ssim_uniform
 from sharpfield.metrics.lpips import Lpips, load_lpips
 from sharpfield.metrics.pose import absolute_error, align, relative_error
@@ -13,7 +13,6 @@ __all__ = [
     "Quality",
     "absolute_error",
     "align",
-    "count_error",
     "event_blur",
     "event_quality",
     "gradient_energy",

@@ -5,8 +5,7 @@ intervals; `weights [*b s]` are the shares of the ray's light, see `ops.composit
 a number 0 to 1 that says how far along the cumulative weight a new sample lies. New samples carry
 no gradient: they say where to look, and looking elsewhere is not how the light is explained.
 
-Sources: NeRF (ECCV 2020), section 5.2 for points; mip-NeRF 360 (CVPR 2022), sections 3 and 4 for
-intervals and the distortion loss.
+Source: NeRF (ECCV 2020), section 5.2.
 """
 
 from collections.abc import Sequence
@@ -108,29 +107,6 @@ def resample_points(
 
 
 @torch.no_grad()
-def resample_intervals(
-    edges: Float[Tensor, "*b e"],
-    weights: Float[Tensor, "*b s"],
-    position: Float[Tensor, "*b m"],
-) -> Float[Tensor, "*b o"]:
-    """Edges of m new intervals whose middles lie where the light came from; o = m + 1.
-
-    Neighbouring intervals meet half way between their centres; the outermost edges mirror the
-    next ones about the outermost centres and stay inside the old range.
-
-    Args:
-        edges: Ascending; e = s + 1.
-        weights: Of the s intervals.
-        position: Ascending, at least two: `stratified_positions`, or their middles.
-    """
-    centre = invert(edges, weights + FLOOR, position)
-    inner = midpoints(centre)
-    first = (2 * centre[..., :1] - inner[..., :1]).maximum(edges[..., :1])
-    last = (2 * centre[..., -1:] - inner[..., -1:]).minimum(edges[..., -1:])
-    return torch.cat([first, inner, last], -1)
-
-
-@torch.no_grad()
 def merge(
     first: Float[Tensor, "*b s"], second: Float[Tensor, "*b m"]
 ) -> tuple[Float[Tensor, "*b t"], Int[Tensor, "*b t"]]:
@@ -150,22 +126,3 @@ def take_along(value: Float[Tensor, "*b t c"], order: Int[Tensor, "*b t"]) -> Te
     row = order.reshape(rays, count) + count * torch.arange(rays, device=order.device)[:, None]
     # Whole rows at once: several times as fast as a gather of single numbers.
     return value.reshape(-1, value.shape[-1]).index_select(0, row.flatten()).reshape(value.shape)
-
-
-def distortion(edges: Float[Tensor, "*b e"], weights: Float[Tensor, "*b s"]) -> Float[Tensor, "*b"]:
-    """How far the weight of a ray is spread: zero when it is all in one thin interval.
-
-    The mean distance of two points drawn from the step function, mip-NeRF 360 eq. 15, in linear
-    instead of quadratic time: with ascending middles m_i every pair i > j contributes
-    w_i w_j (m_i - m_j), so running sums of w and w m are enough.
-
-    Args:
-        edges: Ascending; e = s + 1; normalised distances, so that far away counts as near by.
-        weights: Of the s intervals.
-    """
-    middle = midpoints(edges)
-    before = weights.cumsum(-1) - weights
-    moment = (weights * middle).cumsum(-1) - weights * middle
-    between = 2 * (weights * (middle * before - moment)).sum(-1)
-    within = (weights.square() * edges.diff(dim=-1)).sum(-1) / 3
-    return between + within

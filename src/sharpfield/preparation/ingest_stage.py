@@ -91,10 +91,8 @@ class Stage:
         if not path.is_file():
             return None
         found = load_arrays(path)
-        count, brighter, first_us, last_us = (
-            int(found[name]) for name in ("count", "brighter", "first_us", "last_us")
-        )
-        return Survey(count, brighter, first_us, last_us, found["per_pixel"], found["per_ms"])
+        count, first_us, last_us = (int(found[name]) for name in ("count", "first_us", "last_us"))
+        return Survey(count, first_us, last_us, found["per_pixel"], found["per_ms"])
 
     def write(
         self, parts: Iterator[EventStream], like: EventStream, span_us: tuple[int, int]

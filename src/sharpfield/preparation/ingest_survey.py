@@ -36,8 +36,6 @@ class Survey:
     """What was found."""
 
     count: int
-    brighter: int
-    """Events of polarity +1."""
     first_us: int
     last_us: int
     """Times of the first and the last event; both 0 if there are none."""
@@ -66,7 +64,7 @@ def survey(chunks: Chunks, size: tuple[int, int], where: object, heard: Heard) -
     """
     per_pixel = np.zeros(size[::-1], np.int64)
     per_ms = np.zeros(1, np.int64)
-    count = brighter = first_us = last_us = 0
+    count = first_us = last_us = 0
     for chunk in chunks:
         if not count:
             first_us = int(chunk.t_us[0])
@@ -83,10 +81,9 @@ def survey(chunks: Chunks, size: tuple[int, int], where: object, heard: Heard) -
             per_ms = np.concatenate([per_ms, np.zeros(max(ms, len(per_ms)), np.int64)])
         _count(chunk.x, chunk.y, chunk.t_us, first_us // MS * MS, per_pixel, per_ms)
         count += len(chunk)
-        brighter += int((chunk.p > 0).sum())
         heard(count)
     lasts = (last_us - first_us // MS * MS) // MS + 1
-    return Survey(count, brighter, first_us, last_us, per_pixel, per_ms[:lasts])
+    return Survey(count, first_us, last_us, per_pixel, per_ms[:lasts])
 
 
 def hot_pixels(per_pixel: Int64[np.ndarray, "h w"], times: float) -> Int64[np.ndarray, "n 2"]:

@@ -28,8 +28,6 @@ POINTS = {
 }
 """Ours, and theirs under `neural_points.`, spelled as they are."""
 
-UNUSED = "aggregator.color_branch."
-
 STAGES = ("aux_block_s1", "aux_block_s2", "aux_block_s3")
 
 

@@ -17,7 +17,8 @@ from sharpfield.core.seed import generator
 from sharpfield.fields import HeadSize, MLPField, PlaneField, VoxelGrid
 from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
-from sharpfield.losses.regularizers import roughness, smoothness
+from sharpfield.losses.regularizers import smoothness
+from sharpfield.ops.total_variation import total_variation
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
 from sharpfield.rendering.march import EvenSteps
@@ -118,9 +119,10 @@ class Volume(nn.Module):
         return self.train_view(rays, made, samples=samples)
 
     def smoothness(self) -> Tensor:
-        """Total variation of the planes and lines; zero without any."""
+        """Total variation of the grids; zero without any."""
         if isinstance(self.field, VoxelGrid):
-            return roughness(self.field.cells()[0])
+            # Plenoxels (CVPR 2022) takes the root of the squares instead, at sampled cells.
+            return total_variation(self.field.cells()[0])
         planes, lines = self.field.planes(), self.field.lines()
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
