@@ -30,21 +30,13 @@ from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
 from sharpfield.formation.tone import tone_of
 from sharpfield.losses.photometric import mse
 from sharpfield.losses.windows import counted_error, exact_error
+from sharpfield.recipes import evdnerf
 from sharpfield.recipes.event_term import thresholds_of
 from sharpfield.recipes.frame_term import Terms
 from sharpfield.recipes.moving import MovingOptions, MovingScene
 
-PAPER = Paper(
-    key="sharpfield-evdnerf-physical",
-    title="EvDNeRF made physical",
-    bibtex="""@inproceedings{bhattacharya2024evdnerf,
-  title     = {{EvDNeRF}: Reconstructing Event Data with Dynamic Neural Radiance Fields},
-  author    = {Bhattacharya, Anish and Madaan, Ratnesh and Cladera, Fernando and
-               Vemprala, Sai and Bonatti, Rogerio and Daniilidis, Kostas and
-               Kapoor, Ashish and Kumar, Vijay and Matni, Nikolai and Gupta, Jayesh K.},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  year      = {2024}
-}""",
+PAPER = replace(
+    evdnerf.PAPER, key="sharpfield-evdnerf-physical", title="EvDNeRF made physical", departures=()
 )
 
 

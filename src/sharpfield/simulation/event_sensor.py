@@ -9,7 +9,7 @@ refractory period; table 1 of Gallego et al., *Event-based vision: a survey* (TP
 resolution, latency and background rate of sensors that are sold.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -125,19 +125,7 @@ the least contrast seen is 12 %. Assumed: an everyday threshold of 25 % (0.22 in
 spread over the pixels, the dead time, and the share of hot pixels.
 """
 
-GEN4_HD = EventSensor(
-    threshold_on=0.22,
-    threshold_off=0.22,
-    threshold_sigma=0.02,
-    refractory_us=50.0,
-    refractory_rule="reset",
-    leak_hz=0.05,
-    leak_jitter=0.3,
-    shot_hz=0.05,
-    hot_share=1e-4,
-    cutoff_hz=8000.0,
-    start="random",
-)
+GEN4_HD = replace(GEN3_VGA, refractory_us=50.0, cutoff_hz=8000.0)
 """Prophesee's fourth generation, 1280x720 (Finateu et al., ISSCC 2020).
 
 Published: latency 20 to 150 us (20 us are 8 kHz), 0.1 background events per second and pixel, the

@@ -84,12 +84,7 @@ def trace(surfaces, origin, direction, time_s, footprint):
 def meet(surfaces, origin, direction, time_s, footprint):
     """Which surface each ray meets, the first that covers half of it, and where.
 
-    Args:
-        surfaces: The scene.
-        origin: [n 3] or [1 3] for rays that share it.
-        direction: [n 3], any length.
-        time_s: Seconds, for what sways.
-        footprint: Angle between neighbouring pixels, in rad.
+    The arguments are those of `trace`.
 
     Returns:
         Number of the surface [n], -1 where there is none, and depth [n] in lengths of `direction`.
