@@ -1,12 +1,21 @@
 """Presets of the recipes for moving scenes."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 from sharpfield.fields.space_time import SpaceTimeSize
 from sharpfield.recipes.d_nerf import DNeRF
 from sharpfield.recipes.ev_dynamic_splat import DynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
+
+
+R = TypeVar("R", EvDNeRF, DNeRF)
+
+
+def published(recipe: R) -> R:
+    """The published networks and length."""
+    return recipe
 
 
 def lego(recipe: EvDNeRF) -> EvDNeRF:
@@ -33,11 +42,6 @@ def evdnerf_standard(recipe: EvDNeRF) -> EvDNeRF:
     return replace(recipe.lasting(20_000), rate=5 * recipe.rate, scene=scene)
 
 
-def evdnerf_paper(recipe: EvDNeRF) -> EvDNeRF:
-    """The published networks and length."""
-    return recipe
-
-
 def d_nerf_draft(recipe: DNeRF) -> DNeRF:
     """Smaller networks, fewer pixels, a higher rate; minutes on two processor cores."""
     scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
@@ -48,11 +52,6 @@ def d_nerf_standard(recipe: DNeRF) -> DNeRF:
     """Half as wide; for a graphics card."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
     return replace(recipe.lasting(40_000), rate=1e-3, pixels=1024, scene=scene)
-
-
-def d_nerf_paper(recipe: DNeRF) -> DNeRF:
-    """The published networks and length."""
-    return recipe
 
 
 def physical_draft(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
@@ -84,7 +83,7 @@ def dynamic_standard(recipe: DynamicSplat) -> DynamicSplat:
 
 
 EVDNERF_VARIANTS = {"lego": lego, "real": real}
-EVDNERF_SIZES = {"draft": evdnerf_draft, "standard": evdnerf_standard, "paper": evdnerf_paper}
-D_NERF_SIZES = {"draft": d_nerf_draft, "standard": d_nerf_standard, "paper": d_nerf_paper}
+EVDNERF_SIZES = {"draft": evdnerf_draft, "standard": evdnerf_standard, "paper": published}
+D_NERF_SIZES = {"draft": d_nerf_draft, "standard": d_nerf_standard, "paper": published}
 PHYSICAL_SIZES = {"draft": physical_draft, "standard": physical_standard}
 DYNAMIC_SIZES = {"draft": dynamic_draft, "standard": dynamic_standard}

@@ -190,17 +190,11 @@ VARIANTS: Mapping[str, Mapping[str, Change]] = {
         "blender_minus": blender_minus,
         "cdavis_full": cdavis_full,
     },
-    "nerf": {},
-    "d-nerf": {},
     "evdnerf": EVDNERF_VARIANTS,
-    "evdnerf-physical": {},
-    "dynamic-splat": {},
-    "ev-dynamic-splat": {},
-    "point-nerf": {},
     "hybrid": HYBRID_VARIANTS,
     **dict.fromkeys(SPLATS, {"refine": refine}),
 }
-"""What is modelled, by recipe."""
+"""What is modelled, by recipe; others have no variants."""
 
 SIZES: Mapping[str, Mapping[str, Change]] = {
     "ev-deblur-nerf": {"draft": draft, "standard": standard, "paper": paper},
