@@ -1,12 +1,14 @@
 """Runs of Gaussians through the commands: train, evaluate, render, export."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures import read, write
 from sharpfield.captures.splat_file import read_splats
 from sharpfield.cli.runs import open_run
 from sharpfield.recipes.splat_export import import_splats
@@ -45,6 +47,18 @@ def test_evaluate_measures_a_run_of_gaussians(trained: Path) -> None:
     assert [view["name"] for view in metrics["views"]] == ["0000", "0004"]
     assert metrics["mean"]["psnr"] > 5 and metrics["train"]["steps"] == 4
     assert "<html" in (trained / "report.html").read_text()
+
+
+def test_a_camera_that_reported_nothing_is_as_none(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture = read(recorded)
+    write(replace(capture, events=capture.needed_events[:0]), tmp_path / "silent")
+    words = ("--out", tmp_path / "run", *SMALL)
+    assert run("train", "event-splat", tmp_path / "silent", *words) == 2
+    assert "this needs events, and the capture has none" in capsys.readouterr().err
+    assert run("train", "ev-splat", tmp_path / "silent", "--out", tmp_path / "frames", *SMALL) == 0
+    assert run("evaluate", tmp_path / "frames") == 0
 
 
 @pytest.mark.parametrize("kind", ["trained", "from_events"])

@@ -10,6 +10,7 @@ import torch
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.protocols import Model
+from sharpfield.evaluation import Story, validation, write_report
 from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.metrics import Lpips
 from sharpfield.metrics.lpips import BACKBONES
@@ -50,6 +51,30 @@ def test_a_perfect_model_scores_as_well_as_eight_bits_allow(tmp_path: Path):
         sharpness = view["sharpness"]
         assert sharpness["result"] == pytest.approx(sharpness["truth"], rel=0.05)
         assert sharpness["input"] < sharpness["truth"]
+
+
+def test_a_model_in_colour_is_compared_with_grey_frames_by_its_luma(tmp_path: Path):
+    one = capture()
+    frames = one.needed_frames
+    middle = {"images": frames.images[..., 1:2], "truth": frames.truth[..., 1:2]}
+    grey = replace(one, frames=replace(frames, **middle))
+    metrics = evaluate(Sky(grey), grey, tmp_path)
+    assert metrics["protocol"]["compared_as"] == "luma"
+    assert 5 < metrics["mean"]["psnr"] < 50
+    write_report(tmp_path, grey, metrics, Story("grey"))
+
+
+def test_validation_says_what_evaluation_says(tmp_path: Path):
+    score = validation(capture())
+    assert score is not None
+    metrics = evaluate(Sky(capture(), gain=0.8), capture(), tmp_path)
+    assert score(Sky(capture(), gain=0.8)) == pytest.approx(metrics["mean"]["psnr"], abs=1e-3)
+    blind = capture().without(frames=True)
+    metrics = evaluate(
+        Sky(blind, gain=0.2), capture(), tmp_path, measuring=Measuring(train_views=0)
+    )
+    assert score(Sky(blind, gain=0.2)) == pytest.approx(metrics["mean"]["psnr"], abs=1e-3)
+    assert validation(capture(test=())) is None
 
 
 def test_the_file_is_what_was_returned(tmp_path: Path):

@@ -279,8 +279,8 @@ def test_every_recipe_learns_through_a_rolling_shutter(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "missing", "message"),
     [
-        ("splat", "frames", "nothing is left to learn from"),
-        ("blur-splat", "frames", "nothing is left to learn from"),
+        ("splat", "frames", "learns from frames"),
+        ("blur-splat", "frames", "learns from frames"),
         ("edi-splat", "frames", "this needs frames"),
         ("edi-splat", "events", "this needs events"),
         ("event-splat", "events", "this needs events"),

@@ -87,14 +87,15 @@ def device_named(name: str) -> str:
 
 
 def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
-    """A capture with only some of its streams.
+    """A capture with only some of its streams; without events, if its camera reported none.
 
     Raises:
         OptionError: A name is unknown.
+        CaptureError: Nothing is left.
     """
     if unknown := set(streams) - set(STREAMS):
         raise OptionError("unknown stream", got=", ".join(unknown), do="use frames, events or both")
-    missing = {"frames": capture.frames is None, "events": capture.events is None}
+    missing = {"frames": not capture.frames, "events": not capture.events}
     left = [name for name in streams if not missing[name]]
     if not left:
         raise CaptureError(

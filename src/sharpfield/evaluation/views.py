@@ -90,9 +90,9 @@ def brightness_of(model: Model, views: list[View], *, blind: bool | None = None)
 
     events = model.capture.events
     blind = model.capture.frames is None if blind is None else blind
-    if not blind or events is None:
-        return Brightness(develop)
     compared = [
         (view.light, view.reference.image) for view in views if view.reference.image is not None
     ]
+    if not blind or events is None:
+        return Brightness(develop, grey=any(image.shape[-1] == 1 for _, image in compared))
     return fit_brightness(develop, compared, grey=not events.coloured)

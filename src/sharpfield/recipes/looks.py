@@ -97,10 +97,17 @@ class Looks:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
         if frames is None and options.windows == 0 or events is None and frames is None:
-            raise CaptureError("nothing is left to learn from", where=capture.name)
+            raise CaptureError(
+                "this recipe learns from frames, and there are none",
+                where=capture.name,
+                do="train event-splat, which learns from events alone",
+            )
         if frames is not None and not len(capture.split.train):
             raise CaptureError(
-                "no frame is left to learn from", where=capture.name, got="all are held out"
+                "no frame is left to learn from",
+                where=capture.name,
+                got="all are held out",
+                do="hold out fewer, or none (--hold-out none)",
             )
         self.motion = self.sharp = None
         if events is not None and (frames is None or options.windows > 0 or options.sharp > 0):
