@@ -25,6 +25,22 @@ def test_white(kind: type, white: int):
     assert frames([0], [1], [0], images=np.zeros((1, 2, 2, 1), kind)).white == white
 
 
+TRUTH = np.zeros((2, 3, 4, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("more", "known"),
+    [
+        ({}, [False, False]),
+        ({"truth_known": np.ones(2, bool)}, [False, False]),
+        ({"truth": TRUTH}, [True, True]),
+        ({"truth": TRUTH, "truth_known": np.array([1, 0], np.uint8)}, [True, False]),
+    ],
+)
+def test_which_frames_have_a_sharp_truth(more: dict, known: list[bool]):
+    assert frames([0, 10], [5, 15], [0, 0], **more).with_truth.tolist() == known
+
+
 def test_exposures_may_touch_and_come_in_any_order():
     assert len(frames([10, 0, 20], [20, 10, 30], [0, 0, 0])) == 3
 

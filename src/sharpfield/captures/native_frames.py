@@ -61,7 +61,7 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
         if file != f"{frames.names[i]}.png":
             table["file"] = file
         if frames.truth is not None:
-            table["truth"] = frames.truth_known is None or bool(frames.truth_known[i])
+            table["truth"] = bool(frames.with_truth[i])
             if table["truth"]:
                 write_image(folder / TRUTH / file, frames.truth[i])
         tables.append(table)

@@ -173,8 +173,6 @@ def _counts(count: int, brighter: int, span_us: tuple[int, int] | None) -> dict[
 def _frames_summary(frames: Frames) -> dict[str, Any]:
     sharp = int(frames.exposure.instant.sum())
     duration = frames.exposure.duration_us[~frames.exposure.instant]
-    known = frames.truth_known
-    with_truth = 0 if frames.truth is None else len(frames) if known is None else int(known.sum())
     return {
         "count": len(frames),
         "blurry": len(frames) - sharp,
@@ -193,7 +191,7 @@ def _frames_summary(frames: Frames) -> dict[str, Any]:
         }
         if len(duration)
         else None,
-        "with_truth": with_truth,
+        "with_truth": int(frames.with_truth.sum()),
         "with_depth": frames.depth is not None,
         "with_flow": frames.flow is not None,
     }

@@ -83,10 +83,8 @@ def _write_images(frames: Frames, folder: Path) -> None:
         end=times.close_us.max(),
     )
     if frames.truth is not None:
-        known = np.ones(len(frames), bool) if frames.truth_known is None else frames.truth_known
-        np.savez_compressed(
-            folder / "truth.npz", **{names[i]: frames.truth[i] for i in np.flatnonzero(known)}
-        )
+        truth = {names[i]: frames.truth[i] for i in np.flatnonzero(frames.with_truth)}
+        np.savez_compressed(folder / "truth.npz", **truth)
 
 
 def _write_poses(path: Path, poses: Float64[np.ndarray, "n 3 4"], capture: Capture) -> None:

@@ -47,8 +47,7 @@ def write(capture: Capture, folder: Path | str) -> None:
 def _write_truth(capture: Capture, place: Path) -> None:
     frames = capture.needed_frames
     if frames.truth is not None:
-        known = np.ones(len(frames), bool) if frames.truth_known is None else frames.truth_known
-        for i in np.flatnonzero(known):
+        for i in np.flatnonzero(frames.with_truth):
             write_image(place / f"{i}.png", np.asarray(frames.truth[i]))
     blur = capture.notes.get("blur_px")
     if isinstance(blur, np.ndarray):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64, Shaped, UInt8, UInt16
+from jaxtyping import Bool, Float32, Int64, Shaped, UInt8, UInt16
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.exposure import Exposure
@@ -18,8 +18,8 @@ class Frames:
 
     `images` hold what was stored, display-referred unless `encoding` is "linear"; 8 or 16 bit, with
     1 or 3 channels (RGB). `truth`, where known, is the sharp image at the middle of each
-    exposure, in the same encoding; `truth_known` says for which frames. `depth` and `flow`, where
-    known, say what the scene was like at that instant.
+    exposure, in the same encoding; `truth_known` says for which frames, all if it is None. `depth`
+    and `flow`, where known, say what the scene was like at that instant.
     """
 
     images: UInt8[np.ndarray, "n h w c"] | UInt16[np.ndarray, "n h w c"]
@@ -71,6 +71,13 @@ class Frames:
     def channels(self) -> int:
         """1 (grey) or 3 (RGB)."""
         return self.images.shape[3]
+
+    @property
+    def with_truth(self) -> Bool[np.ndarray, "n"]:
+        """Which frames have a sharp truth."""
+        if self.truth is None or self.truth_known is None:
+            return np.full(len(self), self.truth is not None)
+        return np.asarray(self.truth_known, bool)
 
     @property
     def white(self) -> int:

@@ -52,8 +52,7 @@ def trained_on(capture: Capture, *, limit: int | None = None) -> list[Reference]
     frames = capture.frames
     if frames is None:
         return []
-    known = _known(frames)
-    chosen = capture.split.train[known[capture.split.train]]
+    chosen = capture.split.train[frames.with_truth[capture.split.train]]
     if len(chosen):
         chosen = spread(chosen, len(chosen) if limit is None else limit)
     else:
@@ -70,20 +69,12 @@ def as_display(image: Shaped[np.ndarray, "h w c"]) -> Float[Tensor, "h w c"]:
 
 def _reference(frames: Frames, i: int, *, own_image: bool) -> Reference:
     measured = as_display(frames.images[i])
-    if frames.truth is not None and _known(frames)[i]:
+    if frames.truth is not None and frames.with_truth[i]:
         return Reference(i, frames.names[i], TRUTH, as_display(frames.truth[i]), measured)
     if not own_image:
         return Reference(i, frames.names[i], "", None, measured)
     kind = SHARP if frames.exposure.instant[i] else BLURRED
     return Reference(i, frames.names[i], kind, measured, measured)
-
-
-def _known(frames: Frames) -> Shaped[np.ndarray, "n"]:
-    if frames.truth is None:
-        return np.zeros(len(frames), bool)
-    if frames.truth_known is None:
-        return np.ones(len(frames), bool)
-    return frames.truth_known.astype(bool)
 
 
 def spread(indices: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:

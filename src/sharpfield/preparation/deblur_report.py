@@ -126,9 +126,7 @@ def _mean(scores: list[dict[str, float]]) -> dict[str, float]:
 
 def _truth(capture: Capture, frame: int) -> Picture | None:
     held = capture.needed_frames
-    if held.truth is None or held.truth_known is None or not held.truth_known[frame]:
-        return None
-    return held.truth[frame]
+    return held.truth[frame] if held.truth is not None and held.with_truth[frame] else None
 
 
 def _middle(pictures: Shaped[np.ndarray, "k h w c"]) -> Picture:

@@ -169,10 +169,7 @@ def check_hold_out(capture: Capture, checkup: Checkup) -> None:
             do="hold frames out with --hold-out every:8",
         )
         return
-    known = np.zeros(len(frames), bool)
-    if frames.truth is not None:
-        known = np.ones(len(frames), bool) if frames.truth_known is None else frames.truth_known
-    blurred = ~frames.exposure.instant[test] & ~known[test]
+    blurred = ~frames.exposure.instant[test] & ~frames.with_truth[test]
     if blurred.any():
         checkup.say(
             "warning",
