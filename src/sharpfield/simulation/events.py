@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int16, Int32, Int64
 from numba import njit
 
+from sharpfield.core.capture import Note
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.simulation.event_sensor import (
@@ -103,6 +104,18 @@ class EventPixels:
         assert self.pixels is not None, "thresholds are drawn when the first picture is seen"
         on, off = self.pixels.on.reshape(self._size), self.pixels.off.reshape(self._size)
         return on.astype(np.float32), off.astype(np.float32)
+
+    def notes(self) -> dict[str, Note]:
+        """What a capture should say about its event camera."""
+        on, off = self.thresholds()
+        return {
+            "threshold_on": self.sensor.threshold_on,
+            "threshold_off": self.sensor.threshold_off,
+            "threshold_on_map": on,
+            "threshold_off_map": off,
+            "refractory_us": self.sensor.refractory_us,
+            "log_floor": self.sensor.floor,
+        }
 
     def _follow(
         self, target: Float64[np.ndarray, "n"], light: Float32[np.ndarray, "h w"], gap_ns: int

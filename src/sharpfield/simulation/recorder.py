@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float32, Shaped
+from jaxtyping import Float32
 
+from sharpfield.core.capture import Note
 from sharpfield.core.events import EventStream
 from sharpfield.core.exposure import Exposure
 from sharpfield.core.frames import Frames
@@ -59,15 +60,6 @@ class Recorder:
         """All events."""
         return joined(self._gaps, self._size, bayer=self._event_sensor.bayer)
 
-    def notes(self) -> dict[str, Shaped[np.ndarray, "..."] | float | str]:
+    def notes(self) -> dict[str, Note]:
         """What a capture should say about its sensors."""
-        on, off = self._pixels.thresholds()
-        return {
-            "threshold_on": self._event_sensor.threshold_on,
-            "threshold_off": self._event_sensor.threshold_off,
-            "threshold_on_map": on,
-            "threshold_off_map": off,
-            "refractory_us": self._event_sensor.refractory_us,
-            "log_floor": self._event_sensor.floor,
-            "row_delay_us": self._frame_sensor.row_delay_us,
-        }
+        return {**self._pixels.notes(), "row_delay_us": self._frame_sensor.row_delay_us}

@@ -4,12 +4,13 @@ Frames follow the published Ev-DeblurNeRF data: one exposure every interval, blu
 camera's motion, but every eighth a sharp view at the middle of its slot, held out for testing.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import ceil
 from os import cpu_count
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
@@ -24,6 +25,8 @@ from sharpfield.simulation.events import watch
 from sharpfield.simulation.motion import CameraPath, motion, stamped
 from sharpfield.simulation.recorder import Recorder
 from sharpfield.simulation.scenes import Scene, scene
+
+P = TypeVar("P")
 
 AHEAD = 32
 """Pictures drawn ahead by all cores; bounds memory."""
@@ -141,18 +144,10 @@ def simulate(
     path = motion(path, seed) if isinstance(path, str) else path
     readout = timing.readout_us or ceil(rig.frame_sensor.row_delay_us * (rig.size[1] - 1))
     timing = replace(timing, readout_us=readout)
-    camera, clock, exposure = rig.camera(), Clock(0, timing.span_us()), timing.exposure()
-    recorder = Recorder(
-        rig.size,
-        exposure,
-        frame_sensor=rig.frame_sensor,
-        event_sensor=rig.event_sensor,
-        seed=seed,
-    )
-    for t_us, rgb in pictures(place, path, camera, timing):
-        recorder.see(rgb, t_us)
+    clock = Clock(0, timing.span_us())
+    recorder = record(place, path, rig, timing, timing.exposure(), seed=seed)
     return Capture(
-        camera=camera,
+        camera=rig.camera(),
         trajectory=stamped(path, clock),
         clock=clock,
         near=place.near,
@@ -164,6 +159,22 @@ def simulate(
         source="simulation",
         notes=recorder.notes(),
     )
+
+
+def record(
+    place: Scene, path: CameraPath, rig: Rig, timing: Timing, exposure: Exposure, *, seed: int
+) -> Recorder:
+    """Both cameras of a rig after a whole recording; seed: of their differences and noise."""
+    recorder = Recorder(
+        rig.size,
+        exposure,
+        frame_sensor=rig.frame_sensor,
+        event_sensor=rig.event_sensor,
+        seed=seed,
+    )
+    for t_us, rgb in pictures(place, path, rig.camera(), timing):
+        recorder.see(rgb, t_us)
+    return recorder
 
 
 def view(
@@ -196,10 +207,15 @@ def pictures(
     if timing.most_change:
         yield from watch(draw, instants, most_change=timing.most_change)
         return
+    times = instants.tolist()
+    yield from zip(times, drawn_ahead(draw, times), strict=True)
+
+
+def drawn_ahead(draw: Callable[[int], P], times_us: Sequence[int]) -> Iterator[P]:
+    """Pictures at some times, in their order, drawn by all cores."""
     with ThreadPoolExecutor(cpu_count()) as pool:
-        for first in range(0, len(instants), AHEAD):
-            part = instants[first : first + AHEAD]
-            yield from zip(part.tolist(), pool.map(draw, part.tolist()), strict=True)
+        for first in range(0, len(times_us), AHEAD):
+            yield from pool.map(draw, times_us[first : first + AHEAD])
 
 
 @lru_cache(maxsize=4)

@@ -22,9 +22,8 @@ from sharpfield.simulation.cameras import RING_FOCAL, Standing, Views, ring
 from sharpfield.simulation.flow import depth_and_flow
 from sharpfield.simulation.motion import CameraPath, stamped
 from sharpfield.simulation.moving_scenes import moving_scene
-from sharpfield.simulation.recorder import Recorder
 from sharpfield.simulation.scenes import Scene
-from sharpfield.simulation.simulate import Rig, Timing, pictures
+from sharpfield.simulation.simulate import Rig, Timing, record
 
 MOVING_RIG = Rig(size=(128, 128), focal_of_width=RING_FOCAL)
 MOVING_TIMING = Timing(frames=33, exposure_us=0, interval_us=31_250, step_us=1250, test_every=8)
@@ -107,17 +106,8 @@ def _in_order_of_tracks(views: Views) -> list[tuple[CameraPath, bool]]:
 def _record(
     place: Scene, path: CameraPath, exposure: Exposure, rig: Rig, timing: Timing, seed: int
 ) -> _Track:
-    camera = rig.camera()
-    recorder = Recorder(
-        rig.size,
-        exposure,
-        frame_sensor=rig.frame_sensor,
-        event_sensor=rig.event_sensor,
-        seed=seed,
-    )
-    for t_us, rgb in pictures(place, path, camera, timing):
-        recorder.see(rgb, t_us)
-    seen = [depth_and_flow(place, camera, path, int(t)) for t in exposure.middle_us]
+    recorder = record(place, path, rig, timing, exposure, seed=seed)
+    seen = [depth_and_flow(place, rig.camera(), path, int(t)) for t in exposure.middle_us]
     depth, flow = (np.stack(values) for values in zip(*seen, strict=True))
     frames = replace(recorder.frames(), depth=depth, flow=flow)
     return _Track(frames, recorder.events(), recorder.notes())

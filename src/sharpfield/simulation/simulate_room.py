@@ -8,9 +8,7 @@ instants, and therefore sharp.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from os import cpu_count
 from typing import Literal
 
 import numpy as np
@@ -31,7 +29,7 @@ from sharpfield.simulation.motion import CameraPath, stamped
 from sharpfield.simulation.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.simulation.room import room
 from sharpfield.simulation.scenes import Scene
-from sharpfield.simulation.simulate import AHEAD, MARGIN_US, Rig, view
+from sharpfield.simulation.simulate import MARGIN_US, Rig, drawn_ahead, view
 from sharpfield.simulation.travel import exposure_for, instants, travel
 from sharpfield.simulation.walk import walk
 
@@ -240,9 +238,7 @@ def _pictures(
     def draw(t_us: int) -> Picture:
         return t_us, *view(place, camera, path.poses(np.array([t_us]))[0])
 
-    with ThreadPoolExecutor(cpu_count()) as pool:
-        for first in range(0, len(times_us), AHEAD):
-            yield from pool.map(draw, times_us[first : first + AHEAD].tolist())
+    yield from drawn_ahead(draw, times_us.tolist())
 
 
 class _Recorded:
@@ -302,17 +298,7 @@ class _Recorded:
 
     def notes(self) -> dict[str, Note]:
         """What a capture should say about the event camera."""
-        if self._pixels is None:
-            return {}
-        sensor, (on, off) = self._rig.event_sensor, self._pixels.thresholds()
-        return {
-            "threshold_on": sensor.threshold_on,
-            "threshold_off": sensor.threshold_off,
-            "threshold_on_map": on,
-            "threshold_off_map": off,
-            "refractory_us": sensor.refractory_us,
-            "log_floor": sensor.floor,
-        }
+        return {} if self._pixels is None else self._pixels.notes()
 
 
 def _as_published(
