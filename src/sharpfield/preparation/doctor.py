@@ -65,7 +65,7 @@ def examine(capture: Capture) -> Checkup:
         if capture.frames is not None and len(capture.frames) > 1:
             _tried(checkup, "poses-fit", lambda: check_pictures(capture, checkup))
             check_blur(capture, checkup)
-    elif posed and checkup.has("error"):
+    elif posed:
         checkup.say("note", "poses-fit", "poses were not judged: mend the errors first")
     check_hold_out(capture, checkup)
     return checkup

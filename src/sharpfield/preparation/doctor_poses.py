@@ -68,11 +68,9 @@ def check_pictures(capture: Capture, checkup: Checkup) -> None:
             errors,
         )
     )
-    if matches:
-        most = max(matches, key=len)
-        checkup.pictures[
-            "details that two frames share: green on the lines that poses say, else red"
-        ] = _lines(sharp.pictures[rows], most, capture.camera, poses)
+    checkup.pictures[
+        "details that two frames share: green on the lines that poses say, else red"
+    ] = _lines(sharp.pictures[rows], max(matches, key=len), capture.camera, poses)
     got = f"median {given:.2f} px from the lines, {count} details of {len(matches)} pairs"
     off = abs(np.log(FACTORS[best])) > OFF_BY
     if given > FINE_PX and off and errors[best] < GAIN * given and errors[best] < POOR_PX:

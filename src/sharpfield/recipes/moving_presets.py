@@ -9,7 +9,6 @@ from sharpfield.recipes.ev_dynamic_splat import DynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 
-
 R = TypeVar("R", EvDNeRF, DNeRF)
 
 
