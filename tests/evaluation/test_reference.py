@@ -11,7 +11,6 @@ from sharpfield.evaluation.reference import (
     TRUTH,
     as_display,
     held_out,
-    spread,
     trained_on,
 )
 from tests.evaluation.fake import capture
@@ -59,15 +58,3 @@ def test_white_is_one_whatever_the_depth(dtype):
 
 def test_float_images_are_left_alone():
     assert as_display(np.full((1, 1, 1), 0.25)).item() == 0.25
-
-
-@pytest.mark.parametrize(
-    ("count", "wanted"), [(0, []), (1, [10]), (2, [10, 14]), (3, [10, 12, 14]), (9, None)]
-)
-def test_spread(count: int, wanted: list[int] | None):
-    five = np.arange(10, 15)
-    assert spread(five, count).tolist() == (five.tolist() if wanted is None else wanted)
-
-
-def test_spread_of_nothing():
-    assert spread(np.zeros(0, np.int64), 3).tolist() == []

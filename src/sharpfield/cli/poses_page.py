@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
+from sharpfield.core.selection import evenly_spread
 from sharpfield.evaluation import page
 from sharpfield.evaluation.figures import trajectory_figure
 from sharpfield.evaluation.page import Look, Picture, View, section
@@ -111,7 +112,7 @@ def _failures(about: dict[str, Any]) -> str:
 def _pictures(original: Capture, found: PosesFound) -> str:
     lost = np.flatnonzero(~found.map.registered)[:SHOWN]
     good = np.flatnonzero(found.map.registered)
-    spread = good[np.unique(np.linspace(0, len(good) - 1, SHOWN).round().astype(int))]
+    spread = evenly_spread(good, SHOWN)
     views = [_view(original, found, int(i)) for i in [*lost, *spread]]
     return section(
         "What was seen",

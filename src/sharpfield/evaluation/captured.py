@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import Shaped
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.selection import evenly_spread
 from sharpfield.evaluation import page
 from sharpfield.evaluation.figures import TEST, TRAIN, timeline_figure, trajectory_figure
 from sharpfield.evaluation.page import Look, Picture, section
 from sharpfield.evaluation.pictures import eight_bit, event_picture
-from sharpfield.evaluation.reference import as_display, spread
+from sharpfield.evaluation.reference import as_display
 
 STRIP = 3
 """Frames shown beside the events."""
@@ -72,7 +73,7 @@ def _strip(capture: Capture) -> list[Picture]:
     """Some recorded training frames, and after the first its camera's events around its middle."""
     frames, events = capture.frames, capture.events
     pictures, middle_us, camera = [], None, 0
-    for i in spread(capture.split.train, STRIP) if frames is not None else []:
+    for i in evenly_spread(capture.split.train, STRIP) if frames is not None else []:
         assert frames is not None
         duration = frames.exposure.duration_us[i] / 1000
         caption = f"frame {frames.names[i]}" + (f", {duration:g} ms" if duration else "")

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.selection import evenly_spread
 from sharpfield.evaluation.page import Colours, Picture, View
 from sharpfield.evaluation.pictures import colour_error, eight_bit
-from sharpfield.evaluation.reference import SHARP, TRUTH, Reference, held_out, spread, trained_on
+from sharpfield.evaluation.reference import SHARP, TRUTH, Reference, held_out, trained_on
 from sharpfield.evaluation.tables import number
 from sharpfield.metrics import luma
 from sharpfield.storage.images import read_image
@@ -45,7 +46,7 @@ def compared_views(
         for name, other in metrics.get("baselines", {}).items()
         if "run" in other
     }
-    chosen = [rows[i] for i in spread(np.arange(len(rows)), VIEWS)]
+    chosen = [rows[i] for i in evenly_spread(np.arange(len(rows)), VIEWS)]
     return [
         _view(run, row, known[row["frame"]], others, input_name(capture))
         for row in chosen

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Frames
+from sharpfield.core.selection import evenly_spread
 
 TRUTH, SHARP, BLURRED = "truth", "sharp image", "blurred image"
 
@@ -54,9 +55,11 @@ def trained_on(capture: Capture, *, limit: int | None = None) -> list[Reference]
         return []
     chosen = capture.split.train[frames.with_truth[capture.split.train]]
     if len(chosen):
-        chosen = spread(chosen, len(chosen) if limit is None else limit)
+        chosen = evenly_spread(chosen, len(chosen) if limit is None else limit)
     else:
-        chosen = spread(capture.split.train, UNSCORED if limit is None else min(limit, UNSCORED))
+        chosen = evenly_spread(
+            capture.split.train, UNSCORED if limit is None else min(limit, UNSCORED)
+        )
     return [_reference(frames, int(i), own_image=False) for i in chosen]
 
 
@@ -75,10 +78,3 @@ def _reference(frames: Frames, i: int, *, own_image: bool) -> Reference:
         return Reference(i, frames.names[i], "", None, measured)
     kind = SHARP if frames.exposure.instant[i] else BLURRED
     return Reference(i, frames.names[i], kind, measured, measured)
-
-
-def spread(indices: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
-    """At most `count` of them, evenly spread."""
-    if count >= len(indices):
-        return indices
-    return indices[np.linspace(0, len(indices) - 1, count).round().astype(np.int64)]

@@ -6,7 +6,8 @@ import numpy as np
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.reference import held_out, spread
+from sharpfield.core.selection import evenly_spread
+from sharpfield.evaluation.reference import held_out
 from sharpfield.evaluation.views import brightness_of, seen_at
 from sharpfield.metrics import psnr
 
@@ -27,7 +28,7 @@ def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], flo
     known = [reference for reference in held_out(capture) if reference.image is not None]
     if not known:
         return None
-    chosen = [known[i] for i in spread(np.arange(len(known)), views)]
+    chosen = [known[i] for i in evenly_spread(np.arange(len(known)), views)]
 
     def mean_psnr(model: Model) -> float:
         seen = [seen_at(model, reference, capture) for reference in chosen]

@@ -8,6 +8,7 @@ from jaxtyping import Shaped, UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import write_json
+from sharpfield.core.selection import evenly_spread
 from sharpfield.formation.edi_threshold import edge_density
 from sharpfield.metrics.image import psnr
 from sharpfield.metrics.sharpness import gradient_energy, luma
@@ -73,7 +74,7 @@ def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
 def contact_sheet(capture: Capture, made: Deblurred) -> UInt8[np.ndarray, "H W 3"]:
     """Blurred, deblurred and, where known, true pictures side by side, a few frames of them."""
     held = capture.needed_frames
-    rows = np.unique(np.linspace(0, len(made.frame) - 1, SHEET_ROWS).round().astype(int))
+    rows = evenly_spread(np.arange(len(made.frame)), SHEET_ROWS)
     lines = []
     for row in rows:
         frame = int(made.frame[row])

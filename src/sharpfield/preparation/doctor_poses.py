@@ -15,6 +15,7 @@ from jaxtyping import Float64, Int64
 from sharpfield.captures.native import INTRINSICS, UNKNOWN
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
+from sharpfield.core.selection import evenly_spread
 from sharpfield.preparation.doctor_findings import Checkup, Curve
 from sharpfield.preparation.poses_pictures import Sharp, sharp_pictures
 from sharpfield.preparation.views import PairMatches, find_details, match_pairs, sampson_px
@@ -40,7 +41,7 @@ BLUR_SHARE = 0.15
 def check_pictures(capture: Capture, checkup: Checkup) -> None:
     """Matched details of frames, against poses and focal length."""
     frames = capture.needed_frames
-    chosen = np.unique(np.linspace(0, len(frames) - 1, MOST_PICTURES).round().astype(int))
+    chosen = evenly_spread(np.arange(len(frames)), MOST_PICTURES)
     sharp = sharp_pictures(capture, "auto")
     rows = np.flatnonzero(np.isin(sharp.frame, chosen))
     poses = _poses(capture, sharp)[rows]

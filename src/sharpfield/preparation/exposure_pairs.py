@@ -28,12 +28,13 @@ from numba import njit
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
+from sharpfield.core.selection import evenly_spread
 from sharpfield.formation.edi import FLOOR
 from sharpfield.formation.tone import Tone, tone_of
 from sharpfield.metrics.sharpness import luma
 from sharpfield.ops.event_index import EventIndex, first_since
 from sharpfield.ops.site_colour import site_channels
-from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light
+from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light, neighbours
 
 MOST_WEIGHT = 4.0
 """An event right after a dead time stands for no more thresholds than this."""
@@ -85,9 +86,7 @@ def exposure_pairs(
         CaptureError: There are no events, or not two frames of one camera.
     """
     frames, events = capture.needed_frames, capture.needed_events
-    order = np.lexsort((frames.exposure.open_us, frames.track))
-    pairs = np.stack([order[:-1], order[1:]], -1)
-    pairs = pairs[frames.track[pairs[:, 0]] == frames.track[pairs[:, 1]]]
+    pairs = neighbours(capture, np.arange(len(frames)))
     if not len(pairs) or not len(events):
         raise CaptureError(
             "comparing frames with events needs two frames of one camera, and events",
@@ -96,8 +95,7 @@ def exposure_pairs(
         )
     opens, closes = frames.exposure.open_us[pairs[:, 0]], frames.exposure.close_us[pairs[:, 1]]
     inside = pairs[(opens >= events.t_us[0]) & (closes <= events.t_us[-1])]
-    chosen = inside if len(inside) else pairs
-    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, most).round().astype(int))]
+    chosen = evenly_spread(inside if len(inside) else pairs, most)
     tone = tone_of(encoding or frames.encoding)
     return [_pair(capture, (int(i), int(j)), tone) for i, j in chosen]
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from sharpfield.core.selection import evenly_spread
 from sharpfield.preparation.poses_mapping import Intrinsics, Map
 
 PAIRS = 12
@@ -89,7 +90,7 @@ def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]
     centre = found.poses[:, :, 3]
     apart = np.linalg.norm(centre[one] - centre[two], axis=-1)
     far = np.flatnonzero(apart >= np.quantile(apart, FAR))
-    some = far[np.unique(np.linspace(0, len(far) - 1, PAIRS).round().astype(int))]
+    some = evenly_spread(far, PAIRS)
     return [(int(one[i]), int(two[i]), np.flatnonzero(seen[one[i]] * seen[two[i]])) for i in some]
 
 

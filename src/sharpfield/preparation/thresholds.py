@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.selection import evenly_spread
 from sharpfield.formation.edi import latent
 from sharpfield.formation.edi_threshold import (
     best_threshold,
@@ -60,9 +61,9 @@ def find_thresholds(capture: Capture, motion: EventMotion) -> Found:
         CaptureError: There are no frames, or no events.
     """
     blurred = np.flatnonzero(~capture.needed_frames.exposure.instant)
-    pairs = _neighbours(capture, blurred)
+    pairs = neighbours(capture, blurred)
     if len(pairs):
-        chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, PAIRS).round().astype(int))]
+        chosen = evenly_spread(pairs, PAIRS)
         judges = [_PairJudge.of(capture, motion, pair) for pair in chosen]
         found = best_thresholds(
             lambda tried: float(np.mean([judge.cost(tried) for judge in judges]))
@@ -81,7 +82,7 @@ def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w
     return tone.decode(stored)
 
 
-def _neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
+def neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
     """Consecutive frames of one track, in order of time."""
     held = capture.needed_frames
     order = frames[np.lexsort((held.exposure.open_us[frames], held.track[frames]))]

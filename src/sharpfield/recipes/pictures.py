@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
+from sharpfield.core.selection import evenly_spread
 from sharpfield.formation.edi import latent
 from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.threshold import FixedThresholds
@@ -79,7 +80,7 @@ def sharp_pictures(
     Raises:
         CaptureError: There are no frames, or events and frames differ in size.
     """
-    frames, chosen = capture.needed_frames, spread(capture.split.train, most)
+    frames, chosen = capture.needed_frames, evenly_spread(capture.split.train, most)
     light = np.empty((len(chosen), *frames.images.shape[1:]), np.float32)
     for view, picture in enumerate(sharp_light(capture, thresholds, chosen)):
         light[view] = picture.numpy()
@@ -102,10 +103,3 @@ def sharp_light(
             path = motion.path(frames.exposure.window(int(i)), middle, thresholds)
             picture = latent(picture, path, 0)
         yield picture.clamp(0, 1)
-
-
-def spread(frames: Int64[np.ndarray, "n"], most: int) -> Int64[np.ndarray, "m"]:
-    """At most so many of some frames, evenly."""
-    if len(frames) <= most:
-        return frames
-    return frames[np.linspace(0, len(frames) - 1, most).round().astype(np.int64)]
