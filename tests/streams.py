@@ -7,13 +7,22 @@ from sharpfield.core import EventStream
 WIDTH, HEIGHT = 12, 10
 
 
-def random_events(count: int, *, last_us: int = 90_000, seed: int = 0) -> EventStream:
+def random_events(
+    count: int,
+    *,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    first_us: int = 1_000,
+    last_us: int = 90_000,
+    bayer: str = "",
+    seed: int = 0,
+) -> EventStream:
     draw = np.random.default_rng(seed)
     return EventStream(
-        x=draw.integers(0, WIDTH, count).astype(np.uint16),
-        y=draw.integers(0, HEIGHT, count).astype(np.uint16),
-        t_us=np.sort(draw.integers(1_000, last_us, count)),
+        x=draw.integers(0, size[0], count).astype(np.uint16),
+        y=draw.integers(0, size[1], count).astype(np.uint16),
+        t_us=np.sort(draw.integers(first_us, last_us, count)),
         p=draw.choice(np.array([-1, 1], np.int8), count),
-        width=WIDTH,
-        height=HEIGHT,
+        width=size[0],
+        height=size[1],
+        bayer=bayer,
     )

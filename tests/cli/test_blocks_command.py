@@ -14,7 +14,7 @@ from sharpfield.captures import write
 from sharpfield.cli.runs import open_run
 from sharpfield.training import file_of, read_ledger
 from tests.captures.test_blocks import corridor
-from tests.cli.test_commands import run
+from tests.cli.command import run
 
 STEPS = 30
 TRAINED = ("--steps", str(STEPS), "--device", "cpu", "--checkpoint-every", "5")

@@ -10,27 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.cli.main import main
+from tests.cli.command import run
 
 SMALL = ("--change", "volume.voxels=0,4000", "volume.samples=16,0", "events.pairs=32")
-
-
-def run(*words: object) -> int:
-    """The exit code of a command."""
-    try:
-        main([str(word) for word in words])
-    except SystemExit as end:
-        return int(end.code or 0)
-    return 0
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny capture, made by the command."""
-    out = tmp_path_factory.mktemp("recorded") / "tiny"
-    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
-    assert run("simulate", "--out", out, *words, "--interval-us", 24_000, "--test-every", 4) == 0
-    return out
 
 
 @pytest.fixture(scope="module")

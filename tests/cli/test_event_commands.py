@@ -11,7 +11,7 @@ from sharpfield.captures.event_cache import read_events
 from sharpfield.core.events import merged
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events
-from tests.cli.test_commands import run
+from tests.cli.command import run
 
 FAST = ("--step-ms", 10, "--shortest-ms", 5)
 

@@ -6,7 +6,7 @@ import pytest
 from sharpfield.captures import native
 from sharpfield.storage import write_events
 from sharpfield.storage.images import write_image
-from tests.cli.test_commands import run
+from tests.cli.command import run
 from tests.streams import HEIGHT, WIDTH, random_events
 
 

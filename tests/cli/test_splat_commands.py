@@ -14,17 +14,9 @@ from sharpfield.cli.runs import open_run
 from sharpfield.recipes.splat_export import import_splats
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.view import render_view
-from tests.cli.test_commands import run
+from tests.cli.command import run
 
 SMALL = ("--steps", 4, "--change", "gaussians.budget=300")
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("splats") / "tiny"
-    words = ("--scene", "tiles", "--size", "16x12", "--frames", 5, "--exposure-us", 20_000)
-    assert run("simulate", "--out", out, *words, "--interval-us", 24_000, "--test-every", 4) == 0
-    return out
 
 
 @pytest.fixture(scope="module")

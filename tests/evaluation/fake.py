@@ -12,6 +12,7 @@ from sharpfield.core.capture import Split
 from sharpfield.core.schedule import Group
 from sharpfield.geometry import Stamped
 from sharpfield.rendering.view import render_view
+from tests import streams
 
 CAMERA = Camera(40, 32, 30.0, 30.0, 20.0, 16.0)
 CLOCK = Clock(0, 1_000_000)
@@ -100,15 +101,7 @@ def capture(*, truth: bool = True, test: tuple[int, ...] = (0, 4), events: int =
 
 
 def random_events(count: int) -> EventStream:
-    random = np.random.default_rng(5)
-    return EventStream(
-        x=random.integers(0, 40, count).astype(np.int16),
-        y=random.integers(0, 32, count).astype(np.int16),
-        t_us=np.sort(random.integers(0, 1_000_000, count)),
-        p=random.choice([-1, 1], count).astype(np.int8),
-        width=40,
-        height=32,
-    )
+    return streams.random_events(count, size=(40, 32), first_us=0, last_us=1_000_000, seed=5)
 
 
 def _picture(trajectory: Stamped, time_us: int) -> np.ndarray:

@@ -6,19 +6,11 @@ import numpy as np
 
 from sharpfield.core import EventStream
 from sharpfield.formation.row_clock import on_row_clock
+from tests.streams import random_events
 
 
 def stream() -> EventStream:
-    random = np.random.default_rng(0)
-    count = 200
-    return EventStream(
-        x=random.integers(0, 8, count).astype(np.uint16),
-        y=random.integers(0, 20, count).astype(np.uint16),
-        t_us=np.sort(random.integers(0, 5000, count)),
-        p=random.choice(np.array([-1, 1], np.int8), count),
-        width=8,
-        height=20,
-    )
+    return random_events(200, size=(8, 20), first_us=0, last_us=5000)
 
 
 def test_events_are_earlier_by_the_delay_of_their_row_and_in_order():

@@ -11,7 +11,7 @@ from sharpfield.captures import native
 from sharpfield.core import EventStream
 from sharpfield.preparation.ingest_mend import Mistakes, mended
 from sharpfield.recordings import Recording
-from tests.cli.test_commands import run
+from tests.cli.command import run
 from tests.recordings.captured import expect_equal_events
 from tests.streams import HEIGHT, WIDTH, random_events
 

@@ -8,19 +8,12 @@ from sharpfield.core import EventStream
 from sharpfield.storage import open_events, write_events
 from sharpfield.storage.event_join import join_events
 from sharpfield.storage.event_writer import ROWS, writing_events
+from tests.streams import random_events
 
 
 def long_stream(count: int) -> EventStream:
-    draw = np.random.default_rng(3)
-    return EventStream(
-        x=draw.integers(0, 20, count).astype(np.uint16),
-        y=draw.integers(0, 10, count).astype(np.uint16),
-        t_us=np.sort(draw.integers(1_000_500, 9_000_000, count)),
-        p=draw.choice(np.array([-1, 1], np.int8), count),
-        width=20,
-        height=10,
-        bayer="RGGB",
-    )
+    span = {"first_us": 1_000_500, "last_us": 9_000_000}
+    return random_events(count, size=(20, 10), bayer="RGGB", seed=3, **span)
 
 
 @pytest.mark.parametrize("cuts", [[], [ROWS], [ROWS, 3 * ROWS]])

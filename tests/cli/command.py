@@ -1,0 +1,12 @@
+"""Commands as a user types them."""
+
+from sharpfield.cli.main import main
+
+
+def run(*words: object) -> int:
+    """The exit code of a command."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
