@@ -56,6 +56,14 @@ def capture(**change: Any) -> Capture:
     return Capture(**{**given, **change})
 
 
+def test_thresholds_are_noted_for_all_pixels_or_for_each():
+    notes = {"threshold_on": 0.25, "threshold_off": np.array([[0.1, 0.3], [0.2, 0.9]])}
+    made = capture(notes=notes)
+    assert made.threshold("on") == 0.25
+    assert made.threshold("off") == pytest.approx(0.25)
+    assert capture().threshold("on") is None
+
+
 def test_a_clock_there_and_back():
     t_us = np.array([1_000_000, 1_000_001, 1_234_567, 1_500_000, 900_000], np.int64)
     unit = CLOCK.unit(t_us)

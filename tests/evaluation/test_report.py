@@ -18,7 +18,7 @@ from sharpfield.evaluation.report import flat
 from tests.evaluation.fake import Sky, capture
 
 PAPER = Paper("key2024", "A method & more", "@inproceedings{key2024}", ("It is <better>.",))
-STORY = Story("the sky", PAPER, {"seed": 0, "volume": {"samples": (64, 64)}}, "sharpfield train …")
+STORY = Story("the sky", PAPER, {"seed": 0, "volume": {"samples": (64, 64)}})
 
 
 class Checker(HTMLParser):
@@ -88,7 +88,6 @@ def test_a_whole_run_is_told(tmp_path: Path):
         "It is <better>.",
         "A method & more",
         "@inproceedings{key2024}",
-        "sharpfield train …",
         "volume.samples",
         "64, 64",
         "500 in",

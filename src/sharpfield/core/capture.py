@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ from sharpfield.core.protocols import Trajectory
 
 HELD_BACK_US = 2
 """Rounding of times in published files; poses may end this much before an exposure does."""
+
+USUAL_THRESHOLD = 0.2
+"""Contrast threshold of an event camera that nobody has measured, in natural log."""
 
 Note = Shaped[np.ndarray, "..."] | float | str
 """A fact about a capture that only some sources know."""
@@ -150,6 +154,14 @@ class Capture:
         middle = exposure.middle_us[frames] + round(exposure.readout_us(held.height) / 2)
         time = torch.as_tensor(self.clock.unit(middle)).float()
         return self.trajectory.pose(time, torch.as_tensor(held.track[frames]))
+
+    def threshold(self, sign: Literal["off", "on"]) -> float | None:
+        """Contrast threshold to darker or to brighter, natural log; None if it is not noted.
+
+        Where pixels have thresholds of their own, the median over them.
+        """
+        noted = self.notes.get(f"threshold_{sign}")
+        return None if noted is None else float(np.median(np.asarray(noted, float)))
 
     def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
         """The same capture with frames or events taken away."""

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.captures import event_index
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import USUAL_THRESHOLD, Capture
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.device import device_of
 from sharpfield.metrics import luma, ssim
@@ -33,8 +33,6 @@ FLOOR = 1e-5
 """Light added before the logarithm, for models that do not say what their event camera sees."""
 MOST = 20.0
 """Counts beyond this are taken as this where the range of a measure is fixed."""
-USUAL = 0.2
-"""Threshold where the capture notes none."""
 
 DEFINITIONS = {
     "event_psnr": "dB; peak is twice the largest recorded change of all windows (as published)",
@@ -149,8 +147,8 @@ def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
 
 def _thresholds(capture: Capture) -> tuple[float, float]:
     """To darker and to brighter, as noted."""
-    off, on = (float(capture.notes.get(f"threshold_{sign}", USUAL)) for sign in ("off", "on"))
-    return off, on
+    off, on = capture.threshold("off"), capture.threshold("on")
+    return off or USUAL_THRESHOLD, on or USUAL_THRESHOLD
 
 
 def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:

@@ -38,8 +38,6 @@ class Story:
     """Of the recipe: its departures, and how to cite it."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Everything that was chosen, nested as it comes; shown as a table."""
-    command: str = ""
-    """What to type to get this run again."""
 
 
 def write_report(run: Path, capture: Capture, metrics: Mapping[str, Any], story: Story) -> Path:
@@ -220,9 +218,8 @@ def _protocol(metrics: Mapping[str, Any]) -> str:
 
 
 def _settings(story: Story) -> str:
-    command = f"<pre>{html.escape(story.command)}</pre>" if story.command else ""
     table = page.folded("All settings", page.definitions(flat(story.settings)))
-    return section("How to get it again", command, table)
+    return section("How to get it again", table)
 
 
 def _paper(story: Story) -> str:

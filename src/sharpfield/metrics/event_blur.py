@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import USUAL_THRESHOLD, Capture
 from sharpfield.core.errors import CaptureError
 
 PARTS = 16
@@ -29,8 +29,6 @@ SMOOTHING_PX = 1.0
 """Standard deviation of the blur that slopes and changes are looked at through."""
 HOLD = 0.05
 """Pull of a block's shift towards that of the whole picture, as a share of the mean slope."""
-FALLBACK_THRESHOLD = 0.2
-"""Contrast threshold where the capture does not say; it hardly changes the order of frames."""
 
 
 def event_blur(
@@ -72,10 +70,8 @@ def _changes(capture: Capture, frame: int) -> Float32[np.ndarray, "k h w"]:
     events, camera = capture.needed_events, capture.camera
     opens, closes = capture.needed_frames.exposure.window(frame)
     inside = events.window(opens, max(closes, opens + 1))
-    on, off = (
-        float(np.asarray(capture.notes.get(f"threshold_{sign}", FALLBACK_THRESHOLD)))
-        for sign in ("on", "off")
-    )
+    off = capture.threshold("off") or USUAL_THRESHOLD
+    on = capture.threshold("on") or USUAL_THRESHOLD
     part = (inside.t_us - opens) * PARTS // max(closes - opens, 1)
     column = np.clip(np.floor(inside.x), 0, camera.width - 1).astype(np.int64)
     row = np.clip(np.floor(inside.y), 0, camera.height - 1).astype(np.int64)

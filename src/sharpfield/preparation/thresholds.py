@@ -43,11 +43,10 @@ class Found:
 
 
 def known_thresholds(capture: Capture) -> FixedThresholds | None:
-    """What the source of the capture says, the median over its pixels; None if it is silent."""
-    noted = [capture.notes.get(f"threshold_{sign}") for sign in ("off", "on")]
-    if any(value is None for value in noted):
+    """What the source of the capture says of both signs; None if it is silent."""
+    negative, positive = capture.threshold("off"), capture.threshold("on")
+    if negative is None or positive is None:
         return None
-    negative, positive = (float(np.median(np.asarray(value, float))) for value in noted)
     return FixedThresholds(negative, positive)
 
 

@@ -1,6 +1,6 @@
 """The event term shared by recipes: which pairs a step looks at, and how far off they are."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from sharpfield.captures import event_index
 from sharpfield.captures.draw import PairTable, draw_pairs, pair_table
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import USUAL_THRESHOLD, Capture
 from sharpfield.core.measurements import EventPairs
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group, Schedule
@@ -24,12 +24,6 @@ from sharpfield.formation.response import (
 from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
 from sharpfield.formation.tone import gamma
 from sharpfield.losses.events import BAYER_WEIGHTS, contrast_error
-
-NOTED = ("threshold_off", "threshold_on")
-"""Notes of a capture that give its contrast thresholds to darker and to brighter."""
-
-USUAL = 0.2
-"""Threshold where nothing says otherwise: that of the published synthetic data."""
 
 
 @dataclass(frozen=True)
@@ -141,10 +135,10 @@ def thresholds_of(capture: Capture, given: tuple[float, float] | None) -> tuple[
     """Contrast thresholds to darker and to brighter: given, noted by the capture, or the usual."""
     if given is not None:
         return given
-    negative, positive = (float(capture.notes.get(name, USUAL)) for name in NOTED)
-    return negative, positive
+    negative, positive = capture.threshold("off"), capture.threshold("on")
+    return negative or USUAL_THRESHOLD, positive or USUAL_THRESHOLD
 
 
 def _mono(seen: EventPairs) -> EventPairs:
     """The same pairs as a sensor without a colour filter reports them."""
-    return EventPairs(seen.xy, seen.track, seen.start, seen.end, seen.negative, seen.positive)
+    return replace(seen, channel=None)
