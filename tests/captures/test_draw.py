@@ -11,7 +11,6 @@ from sharpfield.captures.draw import (
     draw_silent,
     pair_table,
     pixel_table,
-    with_successors,
 )
 from sharpfield.core import (
     Camera,
@@ -190,11 +189,6 @@ def test_accumulating_a_range_of_events():
 def test_a_table_for_fewer_successors_cannot_accumulate_more():
     with pytest.raises(AssertionError, match="table of 1 successors"):
         draw_pairs(table_of(stream()), 4, seed=0, step=0, accumulate=(2, 3))
-
-
-def test_annealing_changes_the_population():
-    table = table_of(stream(), successors=3)
-    assert len(with_successors(table, 1)) == len(table_of(stream()))
 
 
 def test_pairs_of_a_rig_stay_with_their_camera():

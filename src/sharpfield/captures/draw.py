@@ -9,7 +9,7 @@ Images and events stay where they are, as they are stored (and may be memory-map
 is drawn is converted.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -147,13 +147,14 @@ def pair_table(
         channel=site_channels(events, index),
         clock=capture.clock,
     )
-    return _populated(table, capture.name)
-
-
-def with_successors(table: PairTable, successors: int) -> PairTable:
-    """The same table for another least number of successors, e.g. while it is annealed."""
-    changed = replace(table, chain=chains(table.index, successors), successors=successors)
-    return _populated(changed, "events")
+    if not len(table):
+        raise CaptureError(
+            f"no event has {successors} later event(s) at its pixel",
+            where=capture.name,
+            got=f"{len(index)} events on {index.sites} pixels",
+            do="use more events, or shorter chains",
+        )
+    return table
 
 
 def draw_pairs(
@@ -278,17 +279,6 @@ def pairs_of(
         positive=_float(brighter),
         channel=None if channel is None else torch.from_numpy(channel),
     )
-
-
-def _populated(table: PairTable, where: object) -> PairTable:
-    if not len(table):
-        raise CaptureError(
-            f"no event has {table.successors} later event(s) at its pixel",
-            where=where,
-            got=f"{len(table.index)} events on {table.index.sites} pixels",
-            do="use more events, or shorter chains",
-        )
-    return table
 
 
 def _float(values: Shaped[np.ndarray, "*b"]) -> Tensor:

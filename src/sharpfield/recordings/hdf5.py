@@ -45,7 +45,6 @@ from sharpfield.storage.event_layouts import (
 CAMERA = "*"
 """Stands in a path for the name of one of several cameras."""
 
-
 DAMAGED = (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError)
 """What h5py may end in where the structure of a file is damaged: a type that does not exist ..."""
 
@@ -65,14 +64,13 @@ class Dialect:
     frames: Callable[[h5py.File, str], Iterator[Frame]] | None = None
     images: str = ""
     """Path of the frames, if the file has any."""
+    records: bool = False
+    """Whether events are records with these columns."""
 
     @property
     def table(self) -> bool:
         """Whether events are rows of one table."""
         return self.columns[0] in ("xytp", "txyp")
-
-    records: bool = False
-    """Whether events are records with these columns."""
 
     def cameras(self, file: h5py.File) -> list[str]:
         """The cameras whose events the file keeps in this way; [""] if there is no choice."""
