@@ -66,6 +66,15 @@ def test_it_never_ends_below_where_it_began():
         torch.testing.assert_close(found.poses[frame], truth)
 
 
+def test_a_model_in_colour_is_refined_against_grey_frames():
+    one = capture()
+    frames = one.needed_frames
+    middle = {"images": frames.images[..., 1:2], "truth": frames.truth[..., 1:2]}
+    grey = replace(one, frames=replace(frames, **middle))
+    found = refine_poses(Sky(grey), grey, how=replace(QUICK, steps=2, every=1))
+    assert all(found.after[frame] >= found.before[frame] > 5 for frame in TEST)
+
+
 def test_without_full_renders_the_last_pose_is_taken():
     model = Sky(capture())
     blind = replace(QUICK, every=0, steps=3)

@@ -220,6 +220,10 @@ def test_other_settings_are_refused():
     with pytest.raises(RunError) as error:
         check_settings({"rate": 0.1, "seed": 0}, {"rate": 0.2, "seed": 0, "new": 1})
     assert "got    new: None before, 1 now; rate: 0.1 before, 0.2 now" in str(error.value)
+    nested = [{"options": {"steps": 9, "looks": {"early": early, "part": 0}}} for early in (0, 1)]
+    with pytest.raises(RunError) as error:
+        check_settings(*nested)
+    assert "got    options.looks.early: 0 before, 1 now\n" in str(error.value)
 
 
 def test_nothing_loaded_is_unpickled(tmp_path: Path):

@@ -282,8 +282,9 @@ def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) ->
         light = render_view(renderer_of(model), model.capture.camera, pose, view.time, rows=rows)
         light = light.rgb.to(twist.device)
         picture = model.develop(light).clamp(0, 1)
-        error = (picture - view.image).square().mean(-1).reshape(-1)
-        found.append(_Seen(twist, float(psnr(picture, view.image)), error))
+        stored = view.image.expand_as(picture)
+        error = (picture - stored).square().mean(-1).reshape(-1)
+        found.append(_Seen(twist, float(psnr(picture, stored)), error))
     return found
 
 

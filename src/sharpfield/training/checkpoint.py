@@ -199,7 +199,7 @@ def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     Raises:
         RunError: Names the settings that differ.
     """
-    saved, now = _as_json(saved), _as_json(now)
+    saved, now = _dotted(_as_json(saved)), _dotted(_as_json(now))
     differing = [key for key in sorted(saved.keys() | now.keys()) if saved.get(key) != now.get(key)]
     if differing:
         changes = [f"{key}: {saved.get(key)!r} before, {now.get(key)!r} now" for key in differing]
@@ -208,6 +208,15 @@ def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
             got="; ".join(changes[:4]),
             do="resume with the same options, or train anew into another folder",
         )
+
+
+def _dotted(nested: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Nested settings under dotted names, so that those that differ can be told one by one."""
+    found: dict[str, Any] = {}
+    for name, value in nested.items():
+        within = isinstance(value, Mapping)
+        found |= _dotted(value, f"{before}{name}.") if within else {before + name: value}
+    return found
 
 
 def _unpacked(header: str | None, path: Path) -> tuple[str, Progress]:
