@@ -105,8 +105,8 @@ def recorded_in(path: Path, span_us: tuple[int, int], view: int) -> EventStream:
         raise CaptureError(
             "nothing was recorded at the time that is rendered",
             where=path,
-            got=f"from {span_us[0]} to {span_us[1]} us",
-            do="times of the file must be on the clock of the capture",
+            got=f"from {span_us[0]} to {span_us[1]} us, view {view}",
+            do="times of the file must be on the clock of the capture; of a rig, it has --view's",
         )
     return merged(found)
 
