@@ -69,6 +69,16 @@ def test_a_softer_scene_is_matched_by_its_contrast_and_holds_elsewhere():
     assert len(twin.until(span[1])) == pytest.approx(len(held_out), rel=0.03)
 
 
+def test_as_much_is_looked_at_whatever_time_is_left_out():
+    own = recorded()
+    whole = match(Waves(own, 1.5), own, matching=SMALL).recorded
+    for away in ((100_000, 300_000), (-5, 200_000), (80_000, 500_000)):
+        found = match(Waves(own, 1.5), own, matching=SMALL, away_from=away).recorded
+        assert found == pytest.approx(whole, rel=0.1)
+    with_nothing_after = match(Waves(own, 1.5), own, matching=SMALL, away_from=(60_000, 400_000))
+    assert with_nothing_after.recorded > 0, "just as long as a lead and its window"
+
+
 def test_every_camera_that_taught_has_its_windows():
     own = recorded(tracks=2)
     both = replace(own.events, track=(np.arange(len(own.events)) % 2).astype(np.uint8), tracks=2)

@@ -146,13 +146,12 @@ def _places(
     found = 0
     for number, track in zip(range(matching.windows), itertools.cycle(tracks), strict=False):
         seat = on_track(model, capture, int(track))
-        first, last = seat.span_us
         share = (number + 0.5) / matching.windows
-        begin = first + round(share * max(last - first - length, 0))
-        end = min(begin + length, last)
-        if away_from is not None and begin < away_from[1] and end > away_from[0]:
+        begin = _start_us(seat.span_us, length, away_from, share)
+        if begin is None:
             continue
         found += 1
+        end = min(begin + length, seat.span_us[1])
         yield replace(seat, span_us=(begin, end)), min(begin + matching.lead_us, end - 1)
     if not found:
         raise OptionError(
@@ -160,6 +159,21 @@ def _places(
             where=capture.name,
             do="predict a shorter stretch of time",
         )
+
+
+def _start_us(
+    span_us: tuple[int, int], length: int, away_from: tuple[int, int] | None, share: float
+) -> int | None:
+    """Where something of a length may begin, at a share of all places; None if there are none."""
+    first, last = span_us
+    if away_from is None:
+        return first + round(share * max(last - first - length, 0))
+    before = min(away_from[0], last) - length + 1 - first
+    after = last - length + 1 - max(away_from[1], first)
+    place = int(share * (max(before, 0) + max(after, 0)))
+    if before > 0 and place < before:
+        return first + place
+    return max(away_from[1], first) + place - max(before, 0) if after > 0 else None
 
 
 def _fit(
