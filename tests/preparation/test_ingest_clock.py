@@ -59,7 +59,9 @@ def shaken(seed: int, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndar
         gaps.append(pixels.see(shown[-1], 1000 * int(t_us)))
     opens_us = 10_000 + 2000 * (np.arange(40, dtype=np.int64) * INTERVAL_US // 2000)
     light = [np.mean(shown[i : i + 6], 0) for i in opens_us // 2000]
-    change = np.abs(np.diff(np.log(np.maximum(light, 1 / 255)), axis=0)).mean((1, 2), dtype=np.float64)
+    change = np.abs(np.diff(np.log(np.maximum(light, 1 / 255)), axis=0)).mean(
+        (1, 2), dtype=np.float64
+    )
     return change, opens_us + 5000, np.bincount(joined(gaps, (48, 32)).t_us // 1000)
 
 

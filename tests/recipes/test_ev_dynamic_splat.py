@@ -47,15 +47,16 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_every_recipe_learns_from_whatever_there_is(case: str):
     recipe, capture = CASES[case]
-    model = small(recipe).build(capture(), 0)
-    probe = [(step, model.draw(step)) for step in range(STEPS - 6, STEPS)]
+    steps = 2 * STEPS if case == "events" else STEPS
+    model = small(recipe).lasting(steps).build(capture(), 0)
+    probe = [(step, model.draw(step)) for step in range(steps - 6, steps)]
 
     @torch.no_grad()
     def loss() -> float:
         return sum(float(sum(model.losses(batch, step).values())) for step, batch in probe)
 
     before = loss()
-    fit(model, adam(model), steps=range(STEPS))
+    fit(model, adam(model), steps=range(steps))
     assert loss() < 0.9 * before
 
 
@@ -64,18 +65,34 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
     late_from = model.heaviest_step
     early, late = model.draw(late_from - 1), model.draw(late_from)
     assert set(early) == {"look", "sharp"} and early["look"].shape == (2, 1)
-    assert set(late) == {"look", "frames", "sharp", "events"} and late["look"].shape == (2, 4)
+    assert set(late) == {"look", "rest", "frames", "sharp", "events"}
+    assert late["look"].shape == (2, 4) and late["rest"].shape == (2, 6)
     assert late["events"].shape == (2, 3, 16, 16, 1)
     assert len(set(late["look"].track[:, 0].tolist())) == 2, "two cameras"
     assert (late["look"].time == late["look"].time[:1]).all(), "at the same instants"
     assert set(model.losses(late, late_from)) == {"blur", "sharp", "events", "idle", "fleeting"}
+    assert set(model.losses(late, STEPS - 1)) == {"blur", "sharp", "events"}, "growing has ended"
+
+
+def test_sharp_frames_are_carried_to_both_ends_of_any_stretch():
+    model = small().build(tiny_moving(), 0)
+    lengths = set()
+    for step in range(model.heaviest_step, STEPS):
+        batch = model.draw(step)
+        assert set(batch) == {"look", "sharp", "events"} and batch["look"].shape == (2, 2)
+        assert batch["events"].shape == (2, 1, 16, 16, 1) and batch["sharp"].shape == (2, 16, 16, 2)
+        first, last = batch["look"].time[0].tolist()
+        assert 0 <= first < last <= 1
+        lengths.add(last - first)
+    assert max(lengths) > 3 * min(lengths)
 
 
 def test_counts_are_those_of_the_camera():
     """But for the parts of an event that light was on its way at either end."""
     capture = tiny_moving()
     model = small().build(capture, 0)
-    seen = model.draw(STEPS - 1)["events"]
+    drawn = [model.draw(step)["events"] for step in range(model.heaviest_step, STEPS)]
+    seen = max(drawn, key=lambda seen: float((seen.end - seen.start).max()))
     events, clock = capture.needed_events, capture.clock
     assert events.track is not None
     for camera in range(2):
@@ -84,7 +101,7 @@ def test_counts_are_those_of_the_camera():
         mine &= (events.t_us > first) & (events.t_us <= last)
         counts = np.zeros((16, 16))
         np.add.at(counts, (events.y[mine], events.x[mine]), 1)
-        assert counts.max() > 2
+        assert counts.max() >= 2
         assert np.abs(seen.positive[camera, 0, ..., 0].numpy() - counts).max() <= 1
 
 
@@ -162,6 +179,9 @@ def test_thresholds_gains_and_offsets_can_be_learned():
     assert {"unknowns", "offset"} <= {group.name for group in model.groups()}
     losses = model.losses(model.draw(STEPS - 1), STEPS - 1)
     assert {"thresholds", "prior"} <= losses.keys()
+    sum(losses.values()).backward()
+    assert model.unknowns.offset_steps is not None
+    assert model.unknowns.offset_steps.grad.abs() > 0, "a stretch of events tells when it was"
 
 
 def test_coloured_events_are_refused():

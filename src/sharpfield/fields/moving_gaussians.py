@@ -57,7 +57,7 @@ class MovingGaussians(Gaussians):
         """How long each lasts, as a part of the capture."""
         return self.log_spans.exp()
 
-    def at(self, time: float) -> "Passing":
+    def at(self, time: float | Float[Tensor, ""]) -> "Passing":
         """Those that are there at a time, 0...1 of the capture."""
         since = time - self.moments
         age = since / self.spans

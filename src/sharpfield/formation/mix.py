@@ -9,6 +9,7 @@ ray, `outer` on their sum.
 
 from collections.abc import Callable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -35,3 +36,17 @@ def mix(
     """
     weight = radiance.weight[..., None]  # [*b, k, 1]
     return outer((weight * inner(radiance.rgb)).sum(-2))
+
+
+def mix_of_few(few: Radiance, rest: Radiance) -> Float[Tensor, "*b c"]:
+    """The mean light of many rays, with the gradient of the mean of a few of them.
+
+    Args:
+        few: Those that learn `[*b, k]`, with weights that add up to 1.
+        rest: The others `[*b, r]`, drawn without a gradient, with their weights in the whole mean.
+    """
+    mean = mix(few)
+    with torch.no_grad():
+        share = 1 - rest.weight.sum(-1)[..., None]
+        missing = mix(rest) + share * mean - mean
+    return mean + missing

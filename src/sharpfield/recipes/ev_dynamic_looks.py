@@ -24,7 +24,7 @@ from sharpfield.formation.event_motion import EventMotion
 from sharpfield.formation.event_phase import phase_at
 from sharpfield.formation.sharp_instants import Belief, SharpInstants
 from sharpfield.ops.event_index import EventIndex
-from sharpfield.recipes.looks import ROUNDED
+from sharpfield.recipes.looks import ROUNDED, spread_over
 
 Times = Int64[np.ndarray, "_"]
 
@@ -36,13 +36,15 @@ class RigLookOptions:
     cameras: int = 2
     """Most cameras of a step."""
     instants: int = 3
-    """Views of an exposure that lasts, and of a stretch of events."""
+    """Views of an exposure through which the scene learns, and of a stretch of events."""
+    draws: int = 3
+    """Views drawn for each of those of an exposure."""
     early: float = 0.7
     """Part of the schedule that looks at single instants, if events can make sharp pictures."""
-    sharp: float = 0.2
-    """Weight of the sharp pictures from events in late steps; in early ones it is 1. 0 leaves them
+    sharp: float = 0.05
+    """Weight of the sharp pictures from events beside a blurred frame; alone it is 1. 0 leaves them
     out altogether."""
-    windows: float = 0.002
+    windows: float = 0.03
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
     alone: float = 0.1
     """The same weight where there are no frames."""
@@ -71,9 +73,13 @@ class RigLooks:
         capture: In the model's space.
         seed: Of the run.
         steps: Length of the schedule.
+        late: Whether events may be late by an unknown time; views of the frames' instants cannot
+            tell, so that events then have steps of their own.
     """
 
-    def __init__(self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int) -> None:
+    def __init__(
+        self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int, late: bool
+    ) -> None:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
         if frames is None and options.alone == 0:
@@ -86,28 +92,44 @@ class RigLooks:
         self.shown = np.zeros(0, np.int64)  # tracks with frames to learn from
         if frames is not None:
             self.shown = np.unique(frames.track[capture.split.train])
-        self.both = all(int(track) in self.seats for track in self.shown)
-        self.sharp = [t for t, seat in self.seats.items() if seat.sharp is not None]
-        self.late_from = int(options.early * steps) if self.sharp and self.both else 0
+        both = all(int(track) in self.seats for track in self.shown)
+        pictures = [t for t, seat in self.seats.items() if seat.sharp is not None]
+        self.sharp = pictures if both else []
+        self.late_from = int(options.early * steps) if self.sharp else 0
+        counted = bool(self.seats) and options.windows > 0
+        self.together = counted and both and not late
+        self.apart = counted and not self.together
+        still = frames is not None and bool(frames.exposure.instant.all())
+        self.pictured = self.together and still and bool(self.sharp)
 
     def draw(self, step: int, belief: Belief) -> Batch:
         """One instant in early steps; in late ones an exposure, or a stretch of events."""
         random = numpy_generator(self.seed, step, "look")
         if step < self.late_from:
             return self._instant(random, belief)
-        if self.capture.frames is None or (self.seats and not self.both and step % 2):
+        if self.capture.frames is None or (self.apart and step % 2):
             return self._stretch(random)
+        if self.pictured:
+            return self._change(random, belief)
         return self._exposure(random, belief)
 
     def _instant(self, random: np.random.Generator, belief: Belief) -> Batch:
         """A sharp picture of each of several cameras, at one instant."""
         tracks = self._cameras(random, np.array(self.sharp))
-        spans = np.array([self._pictures(t).span_us for t in tracks.tolist()])
-        low = int(spans[:, 0].max())
-        times = random.integers(low, max(int(spans[:, 1].min()), low), size=1, endpoint=True)
+        times = random.integers(*self._span_us(tracks), size=1, endpoint=True)
         return {
             "look": self._instants(times, np.ones(1), tracks),
             "sharp": self._sharp(times, tracks, belief),
+        }
+
+    def _change(self, random: np.random.Generator, belief: Belief) -> Batch:
+        """Sharp pictures of several cameras at two instants, and the events between them."""
+        tracks = self._cameras(random, np.array(self.sharp))
+        times = self._within(random, self._span_us(tracks), 2)
+        return {
+            "look": self._instants(times, np.ones(2), tracks),
+            "sharp": self._sharp(times, tracks, belief),
+            "events": self._windows(times, tracks),
         }
 
     def _exposure(self, random: np.random.Generator, belief: Belief) -> Batch:
@@ -120,20 +142,21 @@ class RigLooks:
         others = self._cameras(random, alike[alike != chosen], options.cameras - 1)
         group = np.concatenate([[chosen], others])
         tracks = frames.track[group]
-        count = options.instants if opens < closes else 1
-        place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
-        times = np.rint(opens + (closes - opens) * place).astype(np.int64)
-        weight = np.full(count, 1 / count)
-        counted = self.both and bool(self.seats) and options.windows > 0
-        if counted:
+        few, draws = (options.instants, options.draws) if opens < closes else (1, 1)
+        times, rest = spread_over((opens, closes), few, draws, random)
+        weight = np.full(few, 1 / few)
+        if self.together:
             times, weight = self._with_one_beside(random, times, weight, (opens, closes))
         batch: Batch = {
             "look": self._instants(times, weight, tracks),
             "frames": self._frames(group),
         }
-        if self.both and self.sharp and opens < closes:
+        if len(rest):
+            share = np.full(len(rest), 1 / (few * draws))
+            batch["rest"] = self._instants(rest, share, tracks)
+        if self.sharp and opens < closes:
             batch["sharp"] = self._sharp(times, tracks, belief)
-        if counted:
+        if self.together:
             batch["events"] = self._windows(times, tracks)
         return batch
 
@@ -141,17 +164,27 @@ class RigLooks:
         """A stretch of events of any length, cut into windows."""
         tracks = self._cameras(random, np.array(list(self.seats)))
         t_us = self.capture.needed_events.t_us
-        begin, end = int(t_us[0]), int(t_us[-1])
+        span_us = int(t_us[0]), int(t_us[-1])
+        times = self._within(random, span_us, max(self.options.instants, 2))
+        return {
+            "look": self._instants(times, np.zeros(len(times)), tracks),
+            "events": self._windows(times, tracks),
+        }
+
+    def _within(self, random: np.random.Generator, span_us: tuple[int, int], count: int) -> Times:
+        """Instants spread evenly over a stretch of any length."""
+        begin, end = span_us
         longest = max(min(self.options.longest_us, end - begin), 1)
         shortest = min(self.options.shortest_us, longest)
         length = shortest * (longest / shortest) ** random.random()
         start = begin + random.random() * max(end - begin - length, 0)
-        count = max(self.options.instants, 2)
-        times = np.rint(np.linspace(start, start + length, count)).astype(np.int64)
-        return {
-            "look": self._instants(times, np.zeros(count), tracks),
-            "events": self._windows(times, tracks),
-        }
+        return np.rint(np.linspace(start, start + length, count)).astype(np.int64)
+
+    def _span_us(self, tracks: np.ndarray) -> tuple[int, int]:
+        """From when until when all of some cameras have sharp pictures."""
+        spans = np.array([self._pictures(t).span_us for t in tracks.tolist()])
+        first = int(spans[:, 0].max())
+        return first, max(int(spans[:, 1].min()), first)
 
     def _cameras(
         self, random: np.random.Generator, among: np.ndarray, most: int | None = None

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -18,7 +19,7 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group
 from sharpfield.core.views import Views
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mix import mix, mix_of_few
 from sharpfield.formation.response import luma
 from sharpfield.formation.tone import tone_of
 from sharpfield.geometry.centred import centred
@@ -79,7 +80,8 @@ class DynamicModel(nn.Module):
         self.path = self.capture.trajectory
         self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
         self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
-        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps)
+        late = self.unknowns.offset_steps is not None
+        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps, late=late)
         # Without frames nothing says what stands still but what passes before it.
         alone = recipe.looks.still if capture.frames is not None else 0.0
         self.scene = DynamicScene(
@@ -108,16 +110,20 @@ class DynamicModel(nn.Module):
         """Errors of sharp pictures, of frames, and of the events between instants."""
         assert isinstance(look := batch["look"], Instants)
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
-        only_events = events is not None and frames is None
+        only_events = events is not None and frames is None and sharp is None
         time = self.unknowns.on_time(look.time) if only_events else look.time
-        pose = self.path.pose(time, look.track)
-        light = self.scene.draw(Views(pose, time, look.weight, look.corner, look.size), step=step)
-        terms = self.scene.terms()
+        light = self._drawn(look, time, step)
+        terms = self.scene.terms(step)
         options, unknowns = self.recipe.looks, self.unknowns
         windows = options.alone if self.capture.frames is None else options.windows
         if isinstance(frames, Pixels):
-            exposed = replace(light, rgb=self._exposed(light.rgb, frames))
-            terms["blur"] = (mix(exposed, outer=self.tone.encode) - frames.value).abs().mean()
+            blurred = mix(light)
+            if isinstance(rest := batch.get("rest"), Instants):
+                with torch.no_grad():
+                    others = self._drawn(rest, rest.time, step)
+                blurred = mix_of_few(light, others)
+            stored = self.tone.encode(self._exposed(blurred, frames))
+            terms["blur"] = (stored - frames.value).abs().mean()
         if isinstance(sharp, Pixels):
             weight = options.sharp if isinstance(frames, Pixels) else 1.0
             stored = self.tone.encode(light.rgb)
@@ -128,11 +134,15 @@ class DynamicModel(nn.Module):
             terms["prior"] = prior
         return terms
 
-    def _exposed(self, light: Float[Tensor, "m h w k c"], seen: Pixels) -> Tensor:
+    def _drawn(self, look: Instants, time: Float[Tensor, "m k"], step: int) -> Radiance:
+        """The views of some looks, as if they were taken at a time."""
+        pose = self.path.pose(time, look.track)
+        return self.scene.draw(Views(pose, time, look.weight, look.corner, look.size), step=step)
+
+    def _exposed(self, light: Float[Tensor, "m h w c"], seen: Pixels) -> Tensor:
         if self.unknowns.log_gain is None:
             return light
-        gain = self.unknowns.log_gain[seen.frame[:, 0, 0]].exp()
-        return light * gain[:, None, None, None, None]
+        return light * self.unknowns.log_gain[seen.frame[:, :1, :1, None]].exp()
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""

@@ -19,7 +19,7 @@ from sharpfield.formation.tone import Tone
 from sharpfield.ops.event_index import EventIndex
 from sharpfield.recipes.ev_dynamic_start import moving_start, still_start, usual_colour
 from sharpfield.recipes.markov_growth import idleness, share_out, wander
-from sharpfield.recipes.splat_scene import Rates, gaussian_groups
+from sharpfield.recipes.splat_scene import Rates, gaussian_groups, settling
 from sharpfield.rendering.splat import Splatting
 
 Terms = dict[str, Tensor]
@@ -53,7 +53,8 @@ class DynamicOptions:
     grow_every: int = 100
     """Steps between two rounds in which dead Gaussians move to where live ones are."""
     grow_until: float = 0.85
-    """Part of the schedule after which they no longer do."""
+    """Part of the schedule after which they no longer do, nothing shakes or frees them any more,
+    and all rates fall so that they come to rest."""
     idle: float = 0.01
     """Weight of mean opacity and of mean scale, of those that stand still."""
     idle_moving: float = 1e-3
@@ -111,6 +112,7 @@ class DynamicScene(nn.Module):
         self.behind = nn.Parameter(usual_colour(capture, tone))
         self.splatting = Splatting(capture.camera, tone.decode)
         self.last_growth = int(options.grow_until * steps)
+        self.settling = settling(self.last_growth, steps)
         rates = options.rates
         self.means_rate = exponential(rates.means, rates.means / 100, until=max(steps, 1))
 
@@ -134,8 +136,8 @@ class DynamicScene(nn.Module):
         )
 
     def _moment(self, views: Views, splatting: Splatting, alone: bool) -> Radiance:
-        times = views.time[:, 0].tolist()
-        if len(set(times)) > 1:
+        times = views.time[:, 0]
+        if (times != times[0]).any():
             rows = [self._moment(views[i : i + 1], splatting, alone) for i in range(len(times))]
             return Radiance.cat(rows)
         cloud = self.still if alone else Together(self.still, self.moving.at(times[0]))
@@ -143,9 +145,11 @@ class DynamicScene(nn.Module):
         behind = self.tone.decode(self.behind.clamp(0, 1))
         return replace(light, rgb=light.rgb + (1 - light.opacity[..., None]) * behind)
 
-    def terms(self) -> Terms:
-        """What frees Gaussians of little use, and makes those that move last."""
+    def terms(self, step: int) -> Terms:
+        """What frees Gaussians of little use, and makes those that move last, while they grow."""
         options = self.options
+        if step >= self.last_growth:
+            return {}
         still, moving = (torch.stack(idleness(part)).sum() for part in (self.still, self.moving))
         idle = options.idle * still + options.idle_moving * moving
         fleeting = (self.span / self.moving.spans).mean()
@@ -154,7 +158,9 @@ class DynamicScene(nn.Module):
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         """What becomes of the Gaussians after a step."""
         found: list[tuple[PointSet, Growth]] = []
-        on = (step + 1) % self.options.grow_every == 0 and step < self.last_growth
+        if step >= self.last_growth:
+            return found
+        on = (step + 1) % self.options.grow_every == 0
         parts: dict[str, Gaussians] = {"still": self.still}
         if step >= self.still_until:
             parts["moving"] = self.moving
@@ -176,7 +182,7 @@ class DynamicScene(nn.Module):
         for name, own, when in (("still", self.still, _always), ("moving", self.moving, later)):
             groups += [
                 Group(f"{name} {group.name}", group.parameters, when(group.rate))
-                for group in gaussian_groups(own, rates, self.means_rate)
+                for group in gaussian_groups(own, rates, self.means_rate, self.settling)
             ]
         own, pace = self.moving, SLOWER / self.span
         paths = {

@@ -143,12 +143,9 @@ class Looks:
         frame = self._frame(step)
         opens, closes = frames.exposure.window(frame)
         moved = self.options.blur == "motion" and opens < closes and not still
-        learned, draws = (self.options.instants, self.options.draws) if moved else (1, 1)
-        count = learned * draws
-        place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
-        places = np.rint(opens + (closes - opens) * place).astype(np.int64)
-        chosen = np.arange(learned) * draws + random.integers(draws, size=learned)
-        times, weight = places[chosen], np.full(learned, 1 / learned)
+        few, draws = (self.options.instants, self.options.draws) if moved else (1, 1)
+        times, rest = spread_over((opens, closes), few, draws, random)
+        weight = np.full(few, 1 / few)
         windows = events and self.motion is not None and self.options.windows > 0
         if windows:
             times, weight = self._with_one_beside(times, weight, (opens, closes), random)
@@ -156,9 +153,9 @@ class Looks:
             "look": self._instants(times, weight, frame, part),
             "frames": self._frame_pixels(frame, part),
         }
-        if draws > 1:
-            rest = np.delete(places, chosen)
-            batch["rest"] = self._instants(rest, np.full(len(rest), 1 / count), frame, part)
+        if len(rest):
+            share = 1 / (few * draws)
+            batch["rest"] = self._instants(rest, np.full(len(rest), share), frame, part)
         if self.sharp is not None:
             batch["sharp"] = self._sharp(times, frame, part, belief)
         if windows:
@@ -310,3 +307,15 @@ class Looks:
             channel=torch.arange(3).expand(shape) if shape[-1] == 3 else None,
             slack=slack,
         )
+
+
+def spread_over(
+    window_us: tuple[int, int], few: int, draws: int, random: np.random.Generator
+) -> tuple[Times, Times]:
+    """Instants spread evenly over an exposure: `few` that teach, and the rest of `few * draws`."""
+    opens, closes = window_us
+    count = few * draws
+    place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
+    times = np.rint(opens + (closes - opens) * place).astype(np.int64)
+    chosen = np.arange(few) * draws + random.integers(draws, size=few)
+    return times[chosen], np.delete(times, chosen)

@@ -25,7 +25,7 @@ from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
 from sharpfield.core.schedule import Group
 from sharpfield.core.views import Views
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mix import mix, mix_of_few
 from sharpfield.formation.row_clock import on_row_clock
 from sharpfield.formation.tone import tone_of
 from sharpfield.geometry.normalise import normalised
@@ -177,13 +177,11 @@ class SplatModel(nn.Module):
         A mean of few views is not that over the exposure: if it had to equal the blurred frame
         whatever the instants, a scene that is itself a little blurred would do best.
         """
-        few = mix(light)
         if not isinstance(rest, Instants):
-            return few
+            return mix(light)
         with torch.no_grad():
-            share = 1 - rest.weight.sum(-1)[:, None, None, None]
-            missing = mix(self._drawn(rest, rest.time)) + share * few - few
-        return few + missing
+            others = self._drawn(rest, rest.time)
+        return mix_of_few(light, others)
 
     def _exposed(self, light: Float[Tensor, "m *b c"], frame: Int64[Tensor, "m"]) -> Tensor:
         """Light as bright as each frame was exposed."""
