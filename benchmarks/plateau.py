@@ -17,7 +17,7 @@ from rich.console import Console
 
 from benchmarks.table import Row, save, show
 from sharpfield.captures import native
-from sharpfield.cli.capture_commands import parse_size
+from sharpfield.cli.arguments import parse_size
 from sharpfield.cli.runs import measure, open_run, start
 from sharpfield.core.capture import Capture
 from sharpfield.recipes import recipe_named
