@@ -145,6 +145,18 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> Non
     assert "idle" not in model.losses(late, STEPS - 1), "growing has ended"
 
 
+def test_in_the_end_frames_decide_and_events_no_longer() -> None:
+    model = small("ev-splat", looks=LookOptions(early=0.5, fading=0.1)).build(recorded(), 0)
+    batch, settles = model.draw(STEPS - 1), model.scene.last_growth
+    before, first, last = (model.losses(batch, step) for step in (STEPS // 2, settles, STEPS))
+    for name in ("sharp", "events"):
+        torch.testing.assert_close(first[name], before[name])
+        torch.testing.assert_close(last[name], 0.1 * first[name])
+    torch.testing.assert_close(last["blur"], first["blur"])
+    alone = small("event-splat").build(recorded(), 0)
+    assert alone.guidance(STEPS) == 1, "events alone stay what they are"
+
+
 def test_a_blurred_frame_is_the_mean_of_all_views_with_the_gradient_of_a_few() -> None:
     """Of few views, the error would be that of a frame which was exposed at those few instants."""
     looks = LookOptions(instants=2, draws=4, early=0.0, sharp=0.0, windows=0.0)

@@ -57,6 +57,10 @@ class LookOptions:
     out altogether."""
     windows: float = 0.03
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
+    fading: float = 0.03
+    """What is left of `sharp` and `windows` at the end of the schedule, if there are frames; they
+    fall while Gaussians settle. Events soon tell what is sharp, but are noisy and late in the dark,
+    and no two pixels have the same threshold: in the end, blurred frames are nearer the truth."""
     shortest_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
     longest_us: int = 50_000

@@ -23,7 +23,7 @@ from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pi
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group
+from sharpfield.core.schedule import Group, constant, exponential
 from sharpfield.core.views import Views
 from sharpfield.formation.mix import mix, mix_of_few
 from sharpfield.formation.row_clock import on_row_clock
@@ -114,6 +114,10 @@ class SplatModel(nn.Module):
         early = self.options.early if self.looks.sharp is not None else 0.0
         self.late_from = int(early * recipe.steps)
         self.still_until = int(self.options.still * recipe.steps)
+        self.guidance = constant(1.0)
+        settles = max(self.late_from, self.scene.last_growth)
+        if capture.frames is not None and settles < recipe.steps:
+            self.guidance = exponential(1.0, self.options.fading, begin=settles, until=recipe.steps)
 
     @property
     def heaviest_step(self) -> int:
@@ -145,19 +149,19 @@ class SplatModel(nn.Module):
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
         only_events = events is not None and frames is None
         light = self._drawn(look, self.unknowns.on_time(look.time) if only_events else look.time)
-        terms = self.scene.idleness(step)
+        terms, guidance = self.scene.idleness(step), self.guidance(step)
         if isinstance(frames, Pixels):
             blurred = self._exposed(self._mean(light, batch.get("rest")), frames.frame[:, 0, 0])
             terms["blur"] = (self.tone.encode(blurred) - frames.value).abs().mean()
         if isinstance(sharp, Pixels):
-            weight = 1.0 if step < self.late_from else self.options.sharp
+            weight = 1.0 if step < self.late_from else guidance * self.options.sharp
             stored = self.tone.encode(self._exposed(light.rgb, sharp.frame[:, 0, 0, 0]))
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(depth := batch.get("depth"), Depths):
             drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
             terms["depth"] = self.options.depth * depth_error(drawn, depth.value)
         if isinstance(events, EventPairs):
-            terms |= event_terms(light, events, self.unknowns, self.options.windows)
+            terms |= event_terms(light, events, self.unknowns, guidance * self.options.windows)
         if (prior := self.unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms
