@@ -48,6 +48,8 @@ class RigLookOptions:
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
     alone: float = 0.1
     """The same weight where there are no frames."""
+    fading: float = 0.03
+    """What is left of `sharp` and `windows` beside blurred frames at the end of the schedule."""
     shortest_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
     longest_us: int = 50_000

@@ -25,6 +25,7 @@ from sharpfield.formation.tone import tone_of
 from sharpfield.geometry.centred import centred
 from sharpfield.recipes.ev_dynamic_looks import RigLookOptions, RigLooks
 from sharpfield.recipes.ev_dynamic_scene import DynamicOptions, DynamicScene
+from sharpfield.recipes.splat_scene import settling
 from sharpfield.recipes.unknowns import (
     FLOOR,
     UnknownOptions,
@@ -93,6 +94,8 @@ class DynamicModel(nn.Module):
             still_until=int(alone * recipe.steps),
             seed=seed,
         )
+        settles = max(self.looks.late_from, self.scene.last_growth)
+        self.guidance = settling(settles, recipe.steps, left=recipe.looks.fading)
         self.floor = float(capture.notes.get("log_floor", FLOOR))
 
     @property
@@ -116,6 +119,7 @@ class DynamicModel(nn.Module):
         terms = self.scene.terms(step)
         options, unknowns = self.recipe.looks, self.unknowns
         windows = options.alone if self.capture.frames is None else options.windows
+        guidance = self.guidance(step) if isinstance(frames, Pixels) else 1.0
         if isinstance(frames, Pixels):
             blurred = mix(light)
             if isinstance(rest := batch.get("rest"), Instants):
@@ -125,11 +129,11 @@ class DynamicModel(nn.Module):
             stored = self.tone.encode(self._exposed(blurred, frames))
             terms["blur"] = (stored - frames.value).abs().mean()
         if isinstance(sharp, Pixels):
-            weight = options.sharp if isinstance(frames, Pixels) else 1.0
+            weight = guidance * options.sharp if isinstance(frames, Pixels) else 1.0
             stored = self.tone.encode(light.rgb)
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(events, EventPairs):
-            terms |= event_terms(light, events, unknowns, windows)
+            terms |= event_terms(light, events, unknowns, guidance * windows)
         if (prior := unknowns.prior()) is not None:
             terms["prior"] = prior
         return terms

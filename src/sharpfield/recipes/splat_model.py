@@ -23,7 +23,7 @@ from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pi
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.radiance import Radiance
 from sharpfield.core.rays import Rays
-from sharpfield.core.schedule import Group, constant, exponential
+from sharpfield.core.schedule import Group
 from sharpfield.core.views import Views
 from sharpfield.formation.mix import mix, mix_of_few
 from sharpfield.formation.row_clock import on_row_clock
@@ -32,7 +32,7 @@ from sharpfield.geometry.normalise import normalised
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.recipes.looks import LookOptions, Looks
 from sharpfield.recipes.measured_depth import depth_error
-from sharpfield.recipes.splat_scene import GaussianOptions, SplatScene
+from sharpfield.recipes.splat_scene import GaussianOptions, SplatScene, settling
 from sharpfield.recipes.splat_start import starting_gaussians
 from sharpfield.recipes.unknowns import (
     UnknownOptions,
@@ -114,10 +114,9 @@ class SplatModel(nn.Module):
         early = self.options.early if self.looks.sharp is not None else 0.0
         self.late_from = int(early * recipe.steps)
         self.still_until = int(self.options.still * recipe.steps)
-        self.guidance = constant(1.0)
         settles = max(self.late_from, self.scene.last_growth)
-        if capture.frames is not None and settles < recipe.steps:
-            self.guidance = exponential(1.0, self.options.fading, begin=settles, until=recipe.steps)
+        left = 1.0 if capture.frames is None else self.options.fading
+        self.guidance = settling(settles, recipe.steps, left=left)
 
     @property
     def heaviest_step(self) -> int:

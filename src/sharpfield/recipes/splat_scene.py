@@ -191,11 +191,11 @@ def budget_of(options: GaussianOptions, capture: Capture) -> int:
     return options.budget or max(round(width * height * options.density), LEAST)
 
 
-def settling(begin: int, steps: int) -> Schedule:
-    """1, and from a step on down to a twentieth at the end."""
+def settling(begin: int, steps: int, *, left: float = SETTLED) -> Schedule:
+    """1, and from a step on down to what is left of it at the end."""
     if begin >= steps:
-        return constant(1.0)
-    return exponential(1.0, SETTLED, begin=begin, until=steps)
+        return STEADY
+    return exponential(1.0, left, begin=begin, until=steps)
 
 
 def gaussian_groups(
