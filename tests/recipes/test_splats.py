@@ -369,3 +369,8 @@ def test_a_scene_can_be_seen_through_another_lens() -> None:
 def test_events_of_several_cameras_are_refused():
     with pytest.raises(CaptureError, match="events of 2 cameras|events of 3 cameras"):
         small("ev-splat").build(tiny_moving(30_000), 0)
+
+
+def test_sharp_frames_of_a_rig_need_no_events_to_start_from():
+    before, after = learned(small("splat").build(tiny_moving(), 0))
+    assert after < 0.8 * before

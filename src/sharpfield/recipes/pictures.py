@@ -94,7 +94,8 @@ def sharp_light(
     """The linear light of some frames, one after the other, see `sharp_pictures`."""
     frames = capture.needed_frames
     tone = tone_of(frames.encoding)
-    motion = None if capture.events is None else EventMotion.of(capture)
+    blurred = not frames.exposure.instant[chosen].all()
+    motion = EventMotion.of(capture) if blurred and capture.events is not None else None
     for i in chosen:
         stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
         picture = tone.decode(stored)
