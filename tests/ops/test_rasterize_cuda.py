@@ -16,7 +16,7 @@ from sharpfield.core import MissingExtra, OptionError
 from sharpfield.ops import _dispatch
 from sharpfield.ops import rasterize as definition
 from sharpfield.ops._dispatch import using
-from sharpfield.ops.rasterize import Canvas, Splats, rasterize
+from sharpfield.ops.rasterize import WIDEN, Canvas, Splats, rasterize
 from tests.ops.test_rasterize import CAMERA, scene
 
 POSES = torch.eye(3, 4).repeat(2, 1, 1)
@@ -30,7 +30,7 @@ def fully_fused_projection(
     opacities: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor | None]:  # fmt: skip
     """Camera-from-world matrices in, positions in pixels of the whole image out."""
-    assert covars is None and (eps2d, near_plane) == (0.3, 0.01) and not opacities.requires_grad
+    assert covars is None and (eps2d, near_plane) == (WIDEN, 0.01) and not opacities.requires_grad
     rim = (width - CAMERA.width) // 2  # more than splats are shifted
     assert (width, height) == (CAMERA.width + 2 * rim, CAMERA.height + 2 * rim) and rim in (0, 1)
     camera = replace(

@@ -22,7 +22,7 @@ FLOOR = np.float32(1e-6)
 """Least determinant of a spread before widening, as in the definition."""
 
 ONE, TWO, HALF = np.float32(1), np.float32(2), np.float32(0.5)
-WIDER = np.float32(WIDEN)
+WIDER = np.float32(WIDEN)  # compiled in: whoever changes `WIDEN` must touch this file, too
 
 
 @kernel
