@@ -175,7 +175,7 @@ def test_a_pixel_gathers_light_over_its_area():
         light_of(Wall(sliding()), seat, subpixels=0)
 
 
-def test_scenes_of_gaussians_are_seen_through_subpixels_unless_it_is_said():
+def test_scenes_of_gaussians_are_drawn_as_large_as_their_subpixels_ask():
     class Splats(Wall):
         sizes: ClassVar[list[tuple[int, int]]] = []
 
@@ -189,9 +189,9 @@ def test_scenes_of_gaussians_are_seen_through_subpixels_unless_it_is_said():
             return Radiance(light[..., None].expand(1, height, width, 1, 3), light, light, light)
 
     seat = on_track(Splats(sliding()), sliding(), 0)
-    for subpixels in (None, 1, 3):
+    for subpixels in (1, 3):
         assert light_of(Splats(sliding()), seat, subpixels=subpixels)(0).shape == (5, 6, 3)
-    assert Splats.sizes == [(12, 10), (6, 5), (18, 15)]
+    assert Splats.sizes == [(6, 5), (18, 15)]
 
 
 def test_steps_are_halved_where_light_changes_much():

@@ -129,19 +129,6 @@ def test_views_of_different_times_are_drawn_each_at_its_own():
             torch.testing.assert_close(both[row, :, :, 0], alone.rgb)
 
 
-def test_a_pixel_gathers_light_over_its_area():
-    model = small().build(tiny_moving(), 0)
-    camera, parts = model.capture.camera, model.recipe.gaussians.area
-    pose = model.path.pose(torch.tensor(0.4), torch.tensor(1))
-    fine = camera.scaled(float(parts))
-    with torch.no_grad():
-        seen = render_view(model, camera, pose, 0.4)
-        drawn = render_view(model.through(fine), fine, pose, 0.4)
-    for row, column in ((0, 0), (3, 11), (15, 15)):
-        own = drawn.rgb[parts * row :, parts * column :][:parts, :parts]
-        torch.testing.assert_close(seen.rgb[row, column], own.mean((0, 1)))
-
-
 def test_moving_ones_start_where_something_moves():
     """The hub of the rotor is at the origin, which frames alone always see it cover."""
     capture, _ = centred(tiny_moving())

@@ -84,9 +84,8 @@ class Pixels:
     time that is rendered."""
     seed: int = 0
     """Of what differs from pixel to pixel, and of noise."""
-    subpixels: int | None = None
-    """Along each side of a pixel, whose light is their mean; 2 for Gaussians, otherwise 1, if
-    nothing is said."""
+    subpixels: int = 1
+    """Along each side of a pixel, whose light is their mean."""
     step_ms: float = 4.0
     """Time between two rendered pictures where nothing changes."""
     shortest_ms: float = 1.0

@@ -97,7 +97,7 @@ def match(
     *,
     matching: Matching = MATCHING,
     away_from: tuple[int, int] | None = None,
-    subpixels: int | None = None,
+    subpixels: int = 1,
     pace: Pace = PACE,
 ) -> Match:
     """Compare a model with the recording that taught it.

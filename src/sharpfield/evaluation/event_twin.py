@@ -10,9 +10,8 @@ so a crossing falls at the exact time on that line; instants come closer where l
 A pixel compares with the level of its own last event, however long ago: what `until` tells in many
 windows is, event by event, what it tells in one.
 
-A pixel gathers light over its whole area. Gaussians are drawn wider than they are, so that none
-slips between pixel centres, and what is drawn is softer than what was learned; so the twin looks at
-a picture twice as large, and takes means (`subpixels`).
+A pixel gathers light over its whole area. Gaussians are drawn so much wider than they are; rays see
+a point. `subpixels` takes means over a larger picture instead.
 
 Source: ESIM (Rebecq et al., CoRL 2018) for events from rendered light; EvDNeRF (WACV 2024) for
 rendering it from a learned scene, there as the change between two instants only.
@@ -40,9 +39,6 @@ from sharpfield.simulation.events import EventPixels, Gap, joined, watch
 
 Draw = Callable[[int], Float32[np.ndarray, "h w c"] | Float32[np.ndarray, "h w"]]
 """Linear light at a time in us; the same whenever it is asked."""
-
-AREA = 2
-"""Subpixels along each side of a pixel, for scenes of Gaussians."""
 
 BEHIND_FILTERS = "RGGB"
 """Colour filter tile of a Color-DAVIS346, for events whose positions were rectified."""
@@ -225,7 +221,7 @@ def light_of(
     model: Any,
     seat: Viewpoint,
     *,
-    subpixels: int | None = None,
+    subpixels: int = 1,
     progress: Progress | None = None,
 ) -> Draw:
     """The light that a model sends to a viewpoint.
@@ -233,14 +229,12 @@ def light_of(
     Args:
         model: Trained; of rays or of whole views.
         seat: Where to look from.
-        subpixels: How many times wider and higher the picture is whose means are taken. None for
-            `AREA` where whole views are drawn through any lens, and otherwise 1.
+        subpixels: How many times wider and higher the picture is whose means are taken.
         progress: Told how much of a picture is done.
 
     Raises:
         OptionError: The model cannot be seen through this camera, or there are no subpixels.
     """
-    subpixels = _usual_subpixels(model) if subpixels is None else subpixels
     if subpixels < 1:
         raise OptionError("a pixel has at least one part", got=f"{subpixels} subpixels")
     width, height = seat.camera.size
@@ -303,10 +297,6 @@ def sized(camera: Camera, size: tuple[int, int]) -> Camera:
         cx_px=large.cx_px - (large.width - size[0]) / 2,
         cy_px=large.cy_px - (large.height - size[1]) / 2,
     )
-
-
-def _usual_subpixels(model: Any) -> int:
-    return AREA if isinstance(model, ManyLenses) else 1
 
 
 def _renderer(model: Any, camera: Camera) -> Any:

@@ -40,8 +40,6 @@ class DynamicOptions:
     """Gaussians that stand still, for each pixel of a frame."""
     density_moving: float = 2.25
     """Gaussians that move, for each pixel of a frame, at all times together."""
-    area: int = 2
-    """Subpixels along each side of a pixel, which gathers light over its area."""
     degree: int = 0
     """Of the spherical harmonics of those that stand still."""
     span_ms: float = 120.0
@@ -123,16 +121,13 @@ class DynamicScene(nn.Module):
 
         Args:
             views: Those of the same moment are drawn together.
-            splatting: Of another camera than the capture's, each of whose pixels is drawn once.
+            splatting: Of another camera than the capture's.
             step: Of training; by default it is over.
         """
-        if splatting is None:
-            parts = self.options.area
-            fine = replace(self.splatting, camera=self.splatting.camera.scaled(float(parts)))
-            return averaged(self.draw(finer(views, parts), fine, step=step), parts)
         alone = step is not None and step < self.still_until
+        how = self.splatting if splatting is None else splatting
         return _beside(
-            [self._moment(views[:, j : j + 1], splatting, alone) for j in range(views.shape[1])]
+            [self._moment(views[:, j : j + 1], how, alone) for j in range(views.shape[1])]
         )
 
     def _moment(self, views: Views, splatting: Splatting, alone: bool) -> Radiance:
@@ -200,22 +195,6 @@ class DynamicScene(nn.Module):
     def _later(self, rate: Schedule) -> Schedule:
         """A rate, once moving ones are there."""
         return lambda step: rate(step) if step >= self.still_until else 0.0
-
-
-def finer(views: Views, parts: int) -> Views:
-    """The same views, with each pixel cut into parts along both sides."""
-    size = parts * views.size[0], parts * views.size[1]
-    return replace(views, corner=parts * views.corner, size=size)
-
-
-def averaged(light: Radiance, parts: int) -> Radiance:
-    """Means over pixels that were cut into parts."""
-
-    def mean(values: Tensor) -> Tensor:
-        cut = values.unflatten(2, (-1, parts)).unflatten(1, (-1, parts))
-        return cut.mean((2, 4))
-
-    return Radiance(mean(light.rgb), mean(light.depth), mean(light.opacity), mean(light.weight))
 
 
 def _always(rate: Schedule) -> Schedule:
