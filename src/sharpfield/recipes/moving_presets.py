@@ -69,7 +69,7 @@ def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
 
 def dynamic_draft(recipe: DynamicSplat) -> DynamicSplat:
     """Minutes on two processor cores."""
-    return recipe.lasting(5000)
+    return recipe.lasting(8000)
 
 
 def dynamic_standard(recipe: DynamicSplat) -> DynamicSplat:
