@@ -70,7 +70,7 @@ class Brightness:
 
 def fit_brightness(
     develop: Callable[[Tensor], Tensor],
-    compared: Sequence[tuple[Picture, Picture]],
+    compared: Sequence[tuple[Picture, Float[Tensor, "h w d"]]],
     *,
     grey: bool,
 ) -> Brightness:
