@@ -154,8 +154,8 @@ def test_an_interrupted_training_says_so_to_what_would_follow(
     assert run("train", "ev-deblur-nerf", recorded, "--out", tmp_path / "run", *words) == 130
 
 
-def test_resuming_equals_never_having_stopped(recorded: Path, trained: Path) -> None:
-    again = recorded.parent / "again"
+def test_resuming_equals_never_having_stopped(recorded: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
     words = ("train", "ev-deblur-nerf", recorded, "--out", again, "--preset", "draft", *SMALL)
     assert run(*words, "--steps", 4, "--checkpoint-every", 1) == 0
     last = again / "checkpoints" / "last.safetensors"

@@ -104,7 +104,7 @@ def test_a_run_without_gaussians_is_not_exported(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ("--change", "volume.voxels=0,4000", "volume.samples=16,0", "--preset", "draft")
-    nerf = recorded.parent / "nerf"
+    nerf = tmp_path / "nerf"
     assert run("train", "nerf", recorded, "--out", nerf, "--steps", 2, *small) == 0
     capsys.readouterr()
     assert run("export", nerf, "--out", tmp_path / "scene.ply") == 2
@@ -132,8 +132,8 @@ def test_what_cannot_be_exported_is_said(
     assert message in said and "Traceback" not in said
 
 
-def test_resuming_equals_never_having_stopped(recorded: Path, trained: Path) -> None:
-    again = recorded.parent / "again"
+def test_resuming_equals_never_having_stopped(recorded: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
     words = ("train", "ev-splat", recorded, "--out", again, *SMALL, "--checkpoint-every", 1)
     assert run(*words) == 0
     last = again / "checkpoints" / "last.safetensors"
