@@ -1,6 +1,7 @@
 import torch
 
 from sharpfield.formation import identity, mix
+from sharpfield.formation.mix import mix_of_few
 from tests.formation.toy import lit
 
 
@@ -33,6 +34,21 @@ def test_gradients():
     rgb = torch.rand(2, 3, 1, dtype=torch.float64, requires_grad=True)
     weight = torch.rand(2, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x, w: mix(lit(x, w), inner=torch.exp), (rgb, weight))
+
+
+def test_of_many_rays_a_few_give_the_gradient():
+    """Six rays that count alike, of which two learn."""
+    rgb = torch.rand(4, 6, 3, dtype=torch.float64, requires_grad=True)
+    few, rest = (
+        lit(rgb[:, :2], torch.full((4, 2), 1 / 2)),
+        lit(rgb[:, 2:], torch.full((4, 4), 1 / 6)),
+    )
+    mean = mix_of_few(few, rest)
+    torch.testing.assert_close(mean, rgb.mean(1))
+    mean.square().sum().backward()
+    pull = 2 * mean.detach()[:, None] / 2
+    torch.testing.assert_close(rgb.grad[:, :2], pull.expand(4, 2, 3))
+    assert not rgb.grad[:, 2:].any()
 
 
 def test_no_measurements_give_none():
