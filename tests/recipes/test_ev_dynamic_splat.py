@@ -169,6 +169,9 @@ def test_thresholds_gains_and_offsets_can_be_learned():
     sum(losses.values()).backward()
     assert model.unknowns.offset_steps is not None
     assert model.unknowns.offset_steps.grad.abs() > 0, "a stretch of events tells when it was"
+    model.losses(model.draw(STEPS - 2), STEPS - 2)["blur"].backward()
+    assert model.unknowns.log_gain is not None and model.unknowns.log_gain.grad is not None
+    assert model.unknowns.log_gain.grad.any(), "frames tell how long they were exposed"
 
 
 def test_coloured_events_are_refused():

@@ -75,12 +75,12 @@ class RigLooks:
         capture: In the model's space.
         seed: Of the run.
         steps: Length of the schedule.
-        late: Whether events may be late by an unknown time; views of the frames' instants cannot
+        offset: Whether events may be late by an unknown time; views of the frames' instants cannot
             tell, so that events then have steps of their own.
     """
 
     def __init__(
-        self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int, late: bool
+        self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int, offset: bool
     ) -> None:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
@@ -99,7 +99,7 @@ class RigLooks:
         self.sharp = pictures if both else []
         self.late_from = int(options.early * steps) if self.sharp else 0
         counted = bool(self.seats) and options.windows > 0
-        self.together = counted and both and not late
+        self.together = counted and both and not offset
         self.apart = counted and not self.together
         still = frames is not None and bool(frames.exposure.instant.all())
         self.pictured = self.together and still and bool(self.sharp)

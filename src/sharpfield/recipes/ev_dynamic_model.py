@@ -81,8 +81,8 @@ class DynamicModel(nn.Module):
         self.path = self.capture.trajectory
         self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
         self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
-        late = self.unknowns.offset_steps is not None
-        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps, late=late)
+        offset = self.unknowns.offset_steps is not None
+        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps, offset=offset)
         # Without frames nothing says what stands still but what passes before it.
         alone = recipe.looks.still if capture.frames is not None else 0.0
         self.scene = DynamicScene(

@@ -52,7 +52,7 @@ class DynamicOptions:
     """Steps between two rounds in which dead Gaussians move to where live ones are."""
     grow_until: float = 0.85
     """Part of the schedule after which they no longer do, nothing shakes or frees them any more,
-    and all rates fall so that they come to rest."""
+    and the rates of all but their paths fall further, so that they come to rest."""
     idle: float = 0.01
     """Weight of mean opacity and of mean scale, of those that stand still."""
     idle_moving: float = 1e-3
