@@ -127,8 +127,10 @@ def draw_binned(
     frames = (np.arange(views)[:, None] * windows + np.arange(until)).ravel()
     busy = _busy_places(table, frames, (low, high)) if cropped else None
     half = count // 2
-    if busy is None:
-        held = np.diff(table.first)[frames]
+    held = np.diff(table.first)[frames]
+    if not held.any():  # the scene has not moved yet: there are only silent pixels to look at
+        half, place = 0, np.zeros(0, np.int64)
+    elif busy is None:
         chosen = random.choice(frames[held > 0], half)
         within = random.random(half) * (table.first[chosen + 1] - table.first[chosen])
         place = table.busy[table.first[chosen] + within.astype(np.int64)]
