@@ -22,8 +22,8 @@ from pathlib import Path
 from benchmarks.plain_decode import PLAIN, bag
 from benchmarks.table import Row, save, show
 from benchmarks.tiled import make
-from sharpfield.recordings import open_recording
-from sharpfield.recordings.percent_header import read_header
+from sharpfield.recordings.open import open_recording
+from sharpfield.recordings.prophesee.header import read_header
 
 MEBI = 2**20
 

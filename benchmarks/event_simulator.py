@@ -15,8 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.simulation import SENSORS, EventPixels, EventSensor, Rig, motion, scene, view
-from sharpfield.simulation.event_sensor import LUMA
+from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.scenes.static import scene
+from sharpfield.simulation.sensors.event_pixels import LUMA, SENSORS, EventSensor
+from sharpfield.simulation.sensors.events import EventPixels
+from sharpfield.simulation.simulate import Rig, view
 
 SIZE, PICTURES, RUNS = (346, 260), 200, 5
 MS = 1_000_000

@@ -33,10 +33,10 @@ import numpy as np
 
 from benchmarks.table import Row, save, show
 from benchmarks.tiled import tiled
-from sharpfield.captures.event_cache import cache_folder, event_index, read_events
-from sharpfield.ops.event_index import signed_sum
-from sharpfield.recordings.evt import open_evt
-from sharpfield.storage import open_events
+from sharpfield.events.index import signed_sum
+from sharpfield.recordings.prophesee.evt import open_evt
+from sharpfield.storage.event_cache import cache_folder, event_index, read_events
+from sharpfield.storage.event_layouts import open_events
 
 SAMPLE_EVENTS = 219_596
 WINDOW_US = 10_000

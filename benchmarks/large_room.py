@@ -40,12 +40,12 @@ SOFTEST = 9
 """Widest blur, in pixels."""
 
 STAGES = {
-    "read": ("sharpfield.cli.run_commands", "read"),
+    "read": ("sharpfield.cli.runs", "read"),
     "judge": ("sharpfield.metrics.quality", "quality"),
-    "fuse": ("sharpfield.recipes.point_start", "fuse_points"),
+    "fuse": ("sharpfield.initialisation.point_cloud", "fuse_points"),
     "fit": ("sharpfield.training.train", "fit"),
     "step": ("sharpfield.training.fit", "accumulate"),
-    "grow": ("sharpfield.recipes.point_model", "missing_points"),
+    "grow": ("sharpfield.recipes.points.model", "missing_points"),
     "save": ("sharpfield.training.record", "save_last"),
     "load": ("sharpfield.training.train", "recover"),
 }

@@ -14,15 +14,16 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.table import Row, save, show
-from sharpfield.captures import native
+from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
-from sharpfield.cli.runs import measure, open_run, start
 from sharpfield.core.capture import Capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.simulation import FrameSensor, Rig, Timing, simulate
-from sharpfield.training import Options
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import measure, open_run, start
+from sharpfield.simulation.sensors.frames import FrameSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.training.plan import Options
 
 
 @dataclass(frozen=True)

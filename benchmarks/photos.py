@@ -13,15 +13,16 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.table import Row, save, show
-from sharpfield.captures import native, read
-from sharpfield.captures.shrunk import shrunk
-from sharpfield.cli.runs import open_run, start
-from sharpfield.evaluation import Measuring, evaluate
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.read import read
+from sharpfield.captures.summary import shrunk
+from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.training import Options
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import open_run, start
+from sharpfield.training.plan import Options
 
 REFINED = Refinement(steps=200, rate=5e-4, every=50)
 

@@ -21,8 +21,7 @@ from torch import Generator, Tensor, nn
 
 from benchmarks.plain_field import PlainField, encoded
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
 from sharpfield.core.struct import Struct
 from sharpfield.fields.plane_grid import PlaneField
@@ -33,8 +32,8 @@ from sharpfield.geometry.cast import cast
 from sharpfield.geometry.space import Space
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.ev_deblur_nerf import Model
-from sharpfield.recipes.event_term import EventTerm
-from sharpfield.recipes.frame_term import KernelTerm
+from sharpfield.recipes.volume.event_term import EventTerm
+from sharpfield.recipes.volume.frame_terms import KernelTerm
 
 Returned = dict[str, Tensor]
 """What a render call returns, by name; `[rays, ...]`, but for the scalar `roughness`."""

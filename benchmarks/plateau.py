@@ -16,15 +16,17 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.table import Row, save, show
-from sharpfield.captures import native
+from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
-from sharpfield.cli.runs import measure, open_run, start
 from sharpfield.core.capture import Capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.simulation import MOVING_RIG, Rig, Timing, ring, simulate, simulate_moving
-from sharpfield.training import Options
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import measure, open_run, start
+from sharpfield.simulation.cameras.rigs import ring
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.simulate_moving import MOVING_RIG, simulate_moving
+from sharpfield.training.plan import Options
 
 Size = tuple[int, int]
 

@@ -23,7 +23,7 @@ from benchmarks.event_simulator import peak_mb
 from benchmarks.ops import MEBI, resident_bytes
 from benchmarks.table import Row, save, show
 from sharpfield.core.camera import Camera
-from sharpfield.core.extras import need
+from sharpfield.core.errors import need
 from sharpfield.ops._dispatch import using
 from sharpfield.ops.rasterize import Canvas, rasterize
 

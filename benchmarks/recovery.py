@@ -19,16 +19,18 @@ import torch
 from rich.console import Console
 
 from benchmarks.table import save, show
-from sharpfield.captures import native
+from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
-from sharpfield.cli.runs import measure, open_run, start
 from sharpfield.core.capture import Capture
-from sharpfield.geometry import Stamped, se3
+from sharpfield.geometry import se3
+from sharpfield.geometry.trajectory import Stamped
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.simulation import EventSensor, Rig, Timing, simulate
-from sharpfield.training import Options
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import measure, open_run, start
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.training.plan import Options
 
 THRESHOLDS, GUESS = (0.23, 0.31), (0.25, 0.25)
 LATE_US = 2000

@@ -16,17 +16,18 @@ from pathlib import Path
 from rich.console import Console
 
 from benchmarks.table import Row, save, show
-from sharpfield.captures import native, read
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.read import read
 from sharpfield.cli.arguments import parse_size
-from sharpfield.cli.run_commands import changed
-from sharpfield.cli.runs import measure, open_run, start
+from sharpfield.cli.runs import changed
 from sharpfield.core.capture import Capture
-from sharpfield.evaluation import Measuring
+from sharpfield.evaluation.evaluate import Measuring
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.simulation import ROOM_RIG, RoomTiming, simulate_room
-from sharpfield.training import Options
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import measure, open_run, start
+from sharpfield.simulation.simulate_room import ROOM_RIG, RoomTiming, simulate_room
+from sharpfield.training.plan import Options
 
 
 @dataclass(frozen=True)

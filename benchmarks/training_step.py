@@ -26,11 +26,10 @@ from torch.optim import Adam, Optimizer
 
 from benchmarks.plain import Plain
 from benchmarks.table import Row, save, show
-from sharpfield.captures import read
+from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
-from sharpfield.recipes import EvDeblurNeRF
-from sharpfield.recipes.ev_deblur_nerf import Model
-from sharpfield.simulation import Rig, simulate
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
+from sharpfield.simulation.simulate import Rig, simulate
 from sharpfield.training.memory import available_bytes, kept_bytes
 from sharpfield.training.optim import adam
 

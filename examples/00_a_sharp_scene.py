@@ -13,14 +13,15 @@ import numpy as np
 import torch
 import tyro
 
-from sharpfield.evaluation.pictures import eight_bit
-from sharpfield.metrics import psnr
-from sharpfield.recipes import EvDeblurNeRF
+from sharpfield.metrics.image import psnr
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.presets import prepared
 from sharpfield.rendering.view import render_view
-from sharpfield.simulation import Rig, Timing, simulate
+from sharpfield.report.colormaps import eight_bit
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
-from sharpfield.training import adam, fit
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
 
 
 def main(

@@ -14,9 +14,12 @@ import numpy as np
 import torch
 import tyro
 
-from sharpfield.core import Pixels, Radiance, Rays
-from sharpfield.formation import Shutter, tone_of
-from sharpfield.simulation import Rig, Scene, Timing, scene, simulate
+from sharpfield.core.measurements import Pixels
+from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.tone import tone_of
+from sharpfield.formation.shutter import Shutter
+from sharpfield.simulation.scenes.static import Scene, scene
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
 
 FRAME = 1

@@ -13,8 +13,9 @@ import numpy as np
 import tyro
 
 from sharpfield import core
-from sharpfield.captures import summary, write
-from sharpfield.geometry import Stamped
+from sharpfield.captures.native.layout import write
+from sharpfield.captures.summary import summary
+from sharpfield.geometry.trajectory import Stamped
 
 
 def main(size: tuple[int, int] = (64, 48), out: Path = Path("your_capture")) -> None:

@@ -15,12 +15,17 @@ from typing import ClassVar
 import tyro
 from torch import Tensor, nn
 
-from sharpfield.core import Batch, Capture, Paper
-from sharpfield.formation import Shutter
-from sharpfield.losses import mse
-from sharpfield.recipes.presets import NeRF, nerf_draft
-from sharpfield.simulation import Rig, Timing, simulate
-from sharpfield.training import adam, every, fit
+from sharpfield.core.capture import Capture
+from sharpfield.core.measurements import Batch
+from sharpfield.core.paper import Paper
+from sharpfield.formation.shutter import Shutter
+from sharpfield.losses.photometric import mse
+from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.presets import nerf_draft
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.training.fit import fit
+from sharpfield.training.hooks import every
+from sharpfield.training.optim import adam
 
 
 @dataclass(frozen=True)

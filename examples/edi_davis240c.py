@@ -23,10 +23,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sharpfield.formation.edi import latent, path_of_slices
-from sharpfield.formation.edi_threshold import best_threshold, disagreement
-from sharpfield.formation.log_path import LogPath
-from sharpfield.formation.threshold import FixedThresholds
+from sharpfield.events.edi import latent, path_of_slices
+from sharpfield.events.log_path import LogPath
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import best_threshold, disagreement
 from sharpfield.storage.images import list_images, read_images, write_image
 
 JUDGED = 12

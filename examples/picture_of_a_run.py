@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sharpfield.captures import read
+from sharpfield.captures.read import read
 from sharpfield.core.events import EventStream
-from sharpfield.recipes.saved import read_started
+from sharpfield.runs.config import read_started
 from sharpfield.storage.images import read_image, write_image
 
 SCALE, GAP = 2, 6

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sharpfield.core import EventStream
+from sharpfield.core.events import EventStream
 
 WIDTH, HEIGHT = 12, 10
 

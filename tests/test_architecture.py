@@ -9,10 +9,16 @@ import pytest
 ROOT = Path(__file__).parents[1] / "src" / "sharpfield"
 FLOORS = [
     ["core"],
-    ["geometry", "ops", "storage"],
-    "captures recordings fields rendering formation losses metrics simulation".split(),
-    ["recipes", "training", "evaluation", "preparation"],
-    ["cli", "viewer"],
+    ["geometry", "ops"],
+    ["events"],
+    ["storage"],
+    (
+        "recordings captures sampling formation fields rendering losses metrics simulation report"
+    ).split(),
+    ["initialisation"],
+    "recipes training preparation evaluation twin".split(),
+    ["runs"],
+    ["cli"],
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names}
 LINES, FUNCTION, ARGUMENTS = 400, 60, 8

@@ -7,11 +7,11 @@ import pytest
 
 from benchmarks.plain_decode import PLAIN, bag
 from benchmarks.tiled import SINCE_US, bags, repacked, tiled
-from sharpfield.recordings import open_recording
-from sharpfield.recordings.dat import open_dat
-from sharpfield.recordings.evt import open_evt
-from sharpfield.recordings.percent_header import read_header
-from sharpfield.storage import writing_evt
+from sharpfield.recordings.open import open_recording
+from sharpfield.recordings.prophesee.dat import open_dat
+from sharpfield.recordings.prophesee.evt import open_evt
+from sharpfield.recordings.prophesee.header import read_header
+from sharpfield.storage.evt_writer import writing_evt
 from tests.streams import random_events
 
 COPIES = 3

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import ingest
-from sharpfield.storage import write_events, writing_evt
+from sharpfield.storage.event_writer import write_events
+from sharpfield.storage.evt_writer import writing_evt
 from tests.streams import random_events
 
 

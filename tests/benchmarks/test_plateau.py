@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from benchmarks.plateau import RACES, round_of
-from sharpfield.captures import native
-from sharpfield.core import Capture
-from sharpfield.simulation import Rig, Timing, simulate
+from sharpfield.captures.native import layout as native
+from sharpfield.core.capture import Capture
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 from tests.recipes.moving import tiny_moving
 
 

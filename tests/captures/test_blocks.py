@@ -6,18 +6,11 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.blocks import blocks_of, limited, parsed
-from sharpfield.core import (
-    Camera,
-    Capture,
-    CaptureError,
-    Clock,
-    Exposure,
-    Frames,
-    OptionError,
-    Split,
-)
-from sharpfield.core.depth import DepthMaps
-from sharpfield.geometry import Still
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.frames import DepthMaps, Exposure, Frames
+from sharpfield.geometry.trajectory import Still
 
 CAMERA = Camera(16, 12, 12.0, 12.0, 8.0, 6.0)
 FRAMES = 40

@@ -1,15 +1,18 @@
 import pytest
 
-from sharpfield.captures import LAYOUTS, layout_of, native, read, write, write_llff_events
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.native.layout import write
+from sharpfield.captures.read import LAYOUTS, layout_of, read
+from sharpfield.captures.writers import llff_events as write_llff_events
 from sharpfield.core.errors import CaptureError, OptionError
 
 
-def test_a_capture_is_recognised_by_its_files(tiny, tmp_path):
-    write(tiny, tmp_path / "a")
-    write_llff_events.write(tiny, tmp_path / "b")
+def test_a_capture_is_recognised_by_its_files(panning, tmp_path):
+    write(panning, tmp_path / "a")
+    write_llff_events.write(panning, tmp_path / "b")
     assert layout_of(tmp_path / "a") == "native"
     assert layout_of(tmp_path / "b") == "ev-deblur-nerf"
-    assert read(tmp_path / "a").name == "tiny"
+    assert read(tmp_path / "a").name == "panning"
     assert read(str(tmp_path / "b")).name == "b"
 
 
@@ -45,8 +48,8 @@ def test_a_path_that_is_no_folder(tmp_path):
         read(tmp_path / "events.h5")
 
 
-def test_options_that_do_not_fit(tiny, tmp_path):
-    native.write(tiny, tmp_path)
+def test_options_that_do_not_fit(panning, tmp_path):
+    native.write(panning, tmp_path)
     with pytest.raises(OptionError, match="unknown layout") as caught:
         read(tmp_path, layout="nerf")
     assert "use one of native, ev-deblur-nerf" in str(caught.value)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.shrunk import shrunk
-from sharpfield.core import Capture
+from sharpfield.captures.summary import shrunk
+from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation import Rig, Timing, simulate
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 
 
 @pytest.fixture(scope="module")

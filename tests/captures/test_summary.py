@@ -5,10 +5,11 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures import summary, write, write_llff_events
-from sharpfield.captures.summary import capture_summary
+from sharpfield.captures.native.layout import write
+from sharpfield.captures.summary import capture_summary, summary
+from sharpfield.captures.writers import llff_events as write_llff_events
 from sharpfield.core.errors import CaptureError
-from sharpfield.storage import write_events
+from sharpfield.storage.event_writer import write_events
 
 
 def write_flat(path, events, factor=1):
@@ -21,18 +22,18 @@ def write_flat(path, events, factor=1):
             file[name] = column
 
 
-def test_a_capture(tiny, tmp_path):
-    write(tiny, tmp_path / "tiny")
-    about = summary(tmp_path / "tiny")
-    assert about["kind"] == "capture" and about["name"] == "tiny"
+def test_a_capture(panning, tmp_path):
+    write(panning, tmp_path / "panning")
+    about = summary(tmp_path / "panning")
+    assert about["kind"] == "capture" and about["name"] == "panning"
     events, frames = about["events"], about["frames"]
     assert events["count"] == 5_000
     assert events["on"] + events["off"] == 5_000
-    assert events["on"] == (tiny.events.p > 0).sum()
+    assert events["on"] == (panning.events.p > 0).sum()
     assert (events["width"], events["height"]) == (12, 10)
-    assert events["t_first_us"] == tiny.events.t_us[0]
-    assert events["t_last_us"] == tiny.events.t_us[-1]
-    seconds = (tiny.events.t_us[-1] - tiny.events.t_us[0]) / 1e6
+    assert events["t_first_us"] == panning.events.t_us[0]
+    assert events["t_last_us"] == panning.events.t_us[-1]
+    seconds = (panning.events.t_us[-1] - panning.events.t_us[0]) / 1e6
     assert events["rate_per_s"] == pytest.approx(5_000 / seconds)
     assert (frames["count"], frames["blurry"], frames["sharp"]) == (9, 7, 2)
     assert (frames["width"], frames["height"], frames["bits"]) == (12, 10, 8)
@@ -42,23 +43,23 @@ def test_a_capture(tiny, tmp_path):
     assert about["bounds"] == {"near": 0.7, "far": 9.1}
 
 
-def test_the_path_is_as_long_as_it_is(tiny):
+def test_the_path_is_as_long_as_it_is(panning):
     times = np.linspace(0, 0.25, 10_001)
     centres = np.stack([times, 0.5 * times**2, -times], -1)
     length = np.linalg.norm(np.diff(centres, axis=0), axis=-1).sum()
-    assert capture_summary(tiny)["trajectory"]["path_length"] == pytest.approx(length, rel=1e-4)
+    assert capture_summary(panning)["trajectory"]["path_length"] == pytest.approx(length, rel=1e-4)
 
 
-def test_everything_is_plain_json(tiny, tmp_path):
-    noted = replace(tiny, notes={"threshold_on": 0.2, "map": np.zeros((10, 12))})
-    write(noted, tmp_path / "tiny")
-    about = summary(tmp_path / "tiny")
+def test_everything_is_plain_json(panning, tmp_path):
+    noted = replace(panning, notes={"threshold_on": 0.2, "map": np.zeros((10, 12))})
+    write(noted, tmp_path / "panning")
+    about = summary(tmp_path / "panning")
     assert json.loads(json.dumps(about, allow_nan=False)) == about
     assert about["notes"] == {"threshold_on": 0.2, "map": "array (10, 12)"}
 
 
-def test_photos_of_unknown_motion_are_neither_blurry_nor_sharp(tiny):
-    frames = capture_summary(replace(tiny, notes={"motion": "unknown"}))["frames"]
+def test_photos_of_unknown_motion_are_neither_blurry_nor_sharp(panning):
+    frames = capture_summary(replace(panning, notes={"motion": "unknown"}))["frames"]
     assert frames["count"] == 9 and frames["blurry"] is None and frames["sharp"] is None
 
 
@@ -87,11 +88,11 @@ def test_a_file_that_does_not_state_its_unit(tmp_path, some_events, name):
     assert told["t_last_us"] == events.t_us[-1]
 
 
-def test_the_events_of_a_capture_have_the_unit_of_its_layout(tiny, tmp_path):
-    write_llff_events.write(tiny, tmp_path / "scene")
-    write_flat(tmp_path / "scene" / "events.h5", tiny.events, factor=1_000)
+def test_the_events_of_a_capture_have_the_unit_of_its_layout(panning, tmp_path):
+    write_llff_events.write(panning, tmp_path / "scene")
+    write_flat(tmp_path / "scene" / "events.h5", panning.events, factor=1_000)
     about = summary(tmp_path / "scene" / "events.h5")["events"]
-    assert about["unit"] == "ns" and about["t_last_us"] == tiny.events.t_us[-1]
+    assert about["unit"] == "ns" and about["t_last_us"] == panning.events.t_us[-1]
 
 
 def test_no_events(tmp_path, some_events):

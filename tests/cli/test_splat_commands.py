@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures import read, write
-from sharpfield.captures.splat_file import read_splats
-from sharpfield.cli.runs import open_run
-from sharpfield.recipes.splat_export import import_splats
+from sharpfield.captures.native.layout import write
+from sharpfield.captures.read import read
+from sharpfield.fields.gaussians.export import import_splats
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.view import render_view
+from sharpfield.runs.run import open_run
+from sharpfield.storage.splat_file import read_splats
 from tests.cli.command import run
 
 SMALL = ("--steps", 4, "--change", "gaussians.budget=300")

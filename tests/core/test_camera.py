@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Camera, CaptureError
+from sharpfield.core.camera import Camera
+from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import generator
 
 PINHOLE = Camera(64, 48, 50.0, 55.0, 30.0, 25.0)

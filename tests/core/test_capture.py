@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Camera, Capture, CaptureError, Clock, EventStream, Exposure, Frames
-from sharpfield.core.capture import Split
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Exposure, Frames
 
 CLOCK = Clock(1_000_000, 500_000)
 

@@ -1,6 +1,6 @@
 import pytest
 
-from sharpfield.core import (
+from sharpfield.core.errors import (
     CaptureError,
     MissingExtra,
     OptionError,

@@ -3,8 +3,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, EventStream, SiteColour
-from sharpfield.core.events import checked, merged
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream, SiteColour, checked, merged
 
 
 def stream(**change: Any) -> EventStream:

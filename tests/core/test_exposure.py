@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, Exposure
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import Exposure
 
 
 def us(*times: int) -> np.ndarray:

@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from sharpfield.core.errors import MissingExtra
-from sharpfield.core.extras import need
+from sharpfield.core.errors import MissingExtra, need
 
 
 def test_an_installed_package_is_imported():

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, Exposure, Frames
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import Exposure, Frames
 
 
 def frames(opens: list[int], closes: list[int], tracks: list[int], **more: object) -> Frames:

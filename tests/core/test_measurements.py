@@ -1,6 +1,6 @@
 import torch
 
-from sharpfield.core import EventPairs
+from sharpfield.core.measurements import EventPairs
 
 
 def pairs(negative: list[float], positive: list[float]) -> EventPairs:

@@ -1,11 +1,11 @@
 import numpy as np
 import torch
 
-from sharpfield.core import Field, Head, Renderer, Trajectory
+from sharpfield.core.protocols import Field, Head, Renderer, Trajectory
 from sharpfield.core.seed import generator
-from sharpfield.fields import MLPField
-from sharpfield.geometry import BSpline, LearnedKnots, Metric, Moved, Stamped, Still, Tracks
-from sharpfield.geometry.space import Similarity
+from sharpfield.fields.mlp import MLPField
+from sharpfield.geometry.space import Metric, Similarity
+from sharpfield.geometry.trajectory import BSpline, LearnedKnots, Moved, Stamped, Still, Tracks
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from tests.core.test_capture import CLOCK, Rail, capture
 

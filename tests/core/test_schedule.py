@@ -4,8 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from sharpfield.core import Group
-from sharpfield.core.schedule import constant, cosine, exponential, linear, scaled, staircase
+from sharpfield.core.schedule import Group, constant, cosine, exponential, linear, scaled, staircase
 
 
 @pytest.mark.parametrize("make", [linear, cosine])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sharpfield.core.selection import evenly_spread
+from sharpfield.core.seed import evenly_spread
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])

@@ -5,7 +5,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.core import Pixels, Radiance, Rays, Struct
+from sharpfield.core.measurements import Pixels
+from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.struct import Struct
 
 
 def rays(*shape: int) -> Rays:

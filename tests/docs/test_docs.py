@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from sharpfield.cli import main as command_line
-from sharpfield.cli.run_commands import changed
+from sharpfield.cli.runs import changed
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
 from sharpfield.recipes.presets import names

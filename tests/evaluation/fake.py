@@ -7,10 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from sharpfield.core import Camera, Capture, Clock, EventStream, Exposure, Frames, Radiance, Rays
-from sharpfield.core.capture import Split
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
-from sharpfield.geometry import Stamped
+from sharpfield.geometry.trajectory import Stamped
 from sharpfield.rendering.view import render_view
 from tests import streams
 

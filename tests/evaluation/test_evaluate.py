@@ -10,10 +10,10 @@ import torch
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation import Story, validation, write_report
 from sharpfield.evaluation.evaluate import Measuring, evaluate
-from sharpfield.metrics import Lpips
-from sharpfield.metrics.lpips import BACKBONES
+from sharpfield.evaluation.report import Story, write_report
+from sharpfield.evaluation.views import validation
+from sharpfield.metrics.lpips import BACKBONES, Lpips
 from tests.evaluation.fake import CAMERA, Sky, capture
 
 

@@ -6,8 +6,9 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sharpfield.evaluation import Story, evaluate, write_report
+from sharpfield.evaluation.evaluate import evaluate
 from sharpfield.evaluation.event_films import GAP_PX, WINDOWS, event_films, events_section
+from sharpfield.evaluation.report import Story, write_report
 from tests.evaluation.test_event_scores import Scene
 from tests.evaluation.test_report import checked
 from tests.recipes.moving import tiny_moving

@@ -5,11 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sharpfield.core import Capture
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.capture import Capture
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.evaluation.event_scores import event_scores
-from sharpfield.simulation import moving_scene
+from sharpfield.simulation.scenes.moving import moving_scene
 from tests.evaluation.fake import Sky
 from tests.recipes.moving import tiny_moving
 

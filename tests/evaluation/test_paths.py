@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Capture, Clock, Exposure, Frames, OptionError, Split
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import OptionError
+from sharpfield.core.frames import Exposure, Frames
 from sharpfield.evaluation.paths import camera_path
-from sharpfield.geometry import Still, check_poses
+from sharpfield.geometry.trajectory import Still, check_poses
 from tests.evaluation.fake import CAMERA, capture
 
 SECOND = 1_000_000

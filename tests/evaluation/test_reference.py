@@ -5,14 +5,8 @@ import pytest
 import torch
 
 from sharpfield.core.capture import Split
-from sharpfield.evaluation.reference import (
-    BLURRED,
-    SHARP,
-    TRUTH,
-    as_display,
-    held_out,
-    trained_on,
-)
+from sharpfield.evaluation.views import BLURRED, SHARP, TRUTH, held_out, trained_on
+from sharpfield.report.colormaps import as_display
 from tests.evaluation.fake import capture
 
 

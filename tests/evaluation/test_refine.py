@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Clock, OptionError, Split
+from sharpfield.core.capture import Clock, Split
+from sharpfield.core.errors import OptionError
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
-from sharpfield.geometry import Similarity, Stamped, se3
+from sharpfield.geometry import se3
 from sharpfield.geometry.normalise import moved
+from sharpfield.geometry.space import Similarity
+from sharpfield.geometry.trajectory import Stamped
 from tests.evaluation.fake import Sky, capture
 
 TEST = (0, 4)

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core import Paper
 from sharpfield.core.capture import Split
 from sharpfield.core.events import merged
-from sharpfield.evaluation import Measuring, Story, evaluate, page, report, write_report
-from sharpfield.evaluation.captured import _strip
-from sharpfield.evaluation.compared import input_name
-from sharpfield.evaluation.page import Look, embedded
-from sharpfield.evaluation.report import flat
+from sharpfield.core.paper import Paper
+from sharpfield.evaluation import report
+from sharpfield.evaluation.evaluate import Measuring, evaluate
+from sharpfield.evaluation.report import Story, flat, input_name, write_report
+from sharpfield.report import page
+from sharpfield.report.capture import _strip
+from sharpfield.report.page import Look, embedded
 from tests.evaluation.fake import Sky, capture
 
 PAPER = Paper("key2024", "A method & more", "@inproceedings{key2024}", ("It is <better>.",))

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from sharpfield.fields import HeadSize, MLPField, PlaneField
-from sharpfield.fields.mlp import MLPHead
+from sharpfield.fields.mlp import MLPField, MLPHead
+from sharpfield.fields.plane_grid import HeadSize, PlaneField
 from sharpfield.fields.warp import AtZero, Deformation, Warped
 from sharpfield.ops.encoding import frequencies_width
 

@@ -4,9 +4,10 @@ import pytest
 import torch
 from torch.nn.functional import leaky_relu, linear, normalize
 
-from sharpfield.core.radiance import Samples
+from sharpfield.core.rays import Samples
 from sharpfield.core.seed import generator
-from sharpfield.formation import AdaptiveWeights, adaptive
+from sharpfield.formation import adaptive
+from sharpfield.formation.adaptive import AdaptiveWeights
 from sharpfield.ops.encoding import frequencies
 
 INTEGRATIONS = ["samples", "channels"]

@@ -1,15 +1,11 @@
 import pytest
 import torch
 
-from sharpfield.core import Formation
-from sharpfield.formation import (
-    ChainedContrast,
-    FixedResponse,
-    LearnedResponse,
-    LogContrast,
-    gamma,
-    mix,
-)
+from sharpfield.core.protocols import Formation
+from sharpfield.core.tone import gamma
+from sharpfield.formation.events import ChainedContrast, LogContrast
+from sharpfield.formation.mix import mix
+from sharpfield.formation.response import FixedResponse, LearnedResponse
 from tests.formation.toy import CAMERA, chains, lit, pairs, swaying, wall
 
 

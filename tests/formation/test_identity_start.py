@@ -2,7 +2,7 @@ import copy
 
 import torch
 
-from sharpfield.formation.identity_start import _slope, _views, fit_identity
+from sharpfield.formation.response import _slope, _views, fit_identity
 from sharpfield.ops.dense import Dense
 
 

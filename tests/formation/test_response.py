@@ -4,9 +4,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sharpfield.core.protocols import Response
 from sharpfield.core.seed import generator
-from sharpfield.formation import FixedResponse, LearnedResponse, LogResidual, Response, gamma
-from sharpfield.formation.response import luma, passed
+from sharpfield.core.tone import gamma
+from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual, luma, passed
 from tests.formation.toy import pairs
 
 LEARNED = LearnedResponse()

@@ -3,9 +3,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sharpfield.core import Formation
+from sharpfield.core.protocols import Formation
 from sharpfield.core.seed import generator
-from sharpfield.formation import ORIGIN, Pinhole, RigidKernel, RigidMotions, gamma
+from sharpfield.core.tone import gamma
+from sharpfield.formation.rigid_kernel import ORIGIN, RigidKernel, RigidMotions
+from sharpfield.formation.shutter import Pinhole
 from tests.formation.toy import CAMERA, lit, pixels, swaying, wall
 
 

@@ -1,9 +1,10 @@
 import pytest
 import torch
 
-from sharpfield.core import Formation
+from sharpfield.core.protocols import Formation
 from sharpfield.core.seed import generator
-from sharpfield.formation import Pinhole, Shutter, gamma
+from sharpfield.core.tone import gamma
+from sharpfield.formation.shutter import Pinhole, Shutter
 from tests.formation.toy import CAMERA, pixels, still, swaying, wall
 
 

@@ -1,8 +1,10 @@
 import torch
 
-from sharpfield.core import Formation
+from sharpfield.core.protocols import Formation
 from sharpfield.core.seed import generator
-from sharpfield.formation import Bend, Pinhole, SparseKernel, SparsePoints, gamma
+from sharpfield.core.tone import gamma
+from sharpfield.formation.shutter import Pinhole
+from sharpfield.formation.sparse_kernel import Bend, SparseKernel, SparsePoints
 from tests.formation.toy import CAMERA, lit, pixels, swaying, wall
 
 

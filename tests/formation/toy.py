@@ -4,7 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sharpfield.core import Camera, Clock, EventPairs, Pixels, Radiance, Rays
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Clock
+from sharpfield.core.measurements import EventPairs, Pixels
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Still

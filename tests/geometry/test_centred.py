@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.geometry import Still
-from sharpfield.geometry.centred import centred
+from sharpfield.geometry.normalise import centred
+from sharpfield.geometry.trajectory import Still
 from tests.recipes.moving import tiny_moving
 
 

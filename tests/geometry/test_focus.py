@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sharpfield.geometry.focus import focus
+from sharpfield.geometry.normalise import focus
 
 
 def looking(centre, target):

@@ -4,18 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Camera, Capture, Clock, EventStream, Exposure, Frames
-from sharpfield.geometry import (
-    BSpline,
-    LearnedKnots,
-    LearnedShake,
-    Moved,
-    Stamped,
-    Still,
-    Tracks,
-    count_tracks,
-    se3,
-)
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry import se3
 from sharpfield.geometry.normalise import (
     PATH_SAMPLES,
     change_of,
@@ -24,6 +17,16 @@ from sharpfield.geometry.normalise import (
     reference_poses,
 )
 from sharpfield.geometry.space import Similarity, average_pose
+from sharpfield.geometry.trajectory import (
+    BSpline,
+    LearnedKnots,
+    LearnedShake,
+    Moved,
+    Stamped,
+    Still,
+    Tracks,
+    count_tracks,
+)
 from tests.geometry.toy import points, poses
 
 CAMERA = Camera(40, 32, 30.0, 30.0, 20.0, 16.0)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sharpfield.core import Capture
+from sharpfield.core.capture import Capture
 from sharpfield.geometry import se3
 from sharpfield.geometry.rolling import KNOTS, Rolling, moved_rows
-from sharpfield.simulation import FrameSensor, Rig, Timing, simulate
+from sharpfield.simulation.sensors.frames import FrameSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 
 DELAY_US = 400.0
 

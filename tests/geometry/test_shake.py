@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.geometry import LearnedShake, Still, se3, spline
+from sharpfield.geometry import se3, spline
+from sharpfield.geometry.trajectory import LearnedShake, Still
 from tests.geometry.toy import poses, twists
 
 OPENS = torch.tensor([0.0, 0.3, 0.7], dtype=torch.float64)

@@ -2,9 +2,18 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Camera, Rays
-from sharpfield.geometry import Frustum, Metric, Similarity, ndc, normalisation, se3
-from sharpfield.geometry.space import average_pose, forward_facing
+from sharpfield.core.camera import Camera
+from sharpfield.core.rays import Rays
+from sharpfield.geometry import se3
+from sharpfield.geometry.space import (
+    Frustum,
+    Metric,
+    Similarity,
+    average_pose,
+    forward_facing,
+    ndc,
+    normalisation,
+)
 from sharpfield.ops.grid import grid_shape
 from tests.geometry.toy import points, poses
 

@@ -5,8 +5,11 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from sharpfield.core import CaptureError, Clock
-from sharpfield.geometry import (
+from sharpfield.core.capture import Clock
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry import se3, spline
+from sharpfield.geometry.space import Similarity
+from sharpfield.geometry.trajectory import (
     BSpline,
     LearnedKnots,
     Moved,
@@ -14,10 +17,7 @@ from sharpfield.geometry import (
     Still,
     Tracks,
     check_poses,
-    se3,
-    spline,
 )
-from sharpfield.geometry.space import Similarity
 from tests.geometry.toy import poses
 
 CLOCK = Clock(5_000_000, 2_000_000)

@@ -5,8 +5,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from sharpfield.cli.runs import open_run
 from sharpfield.rendering.view import render_view, renderer_of
+from sharpfield.runs.run import open_run
 
 
 def first_view(run: Path) -> tuple[int, Tensor]:

@@ -5,21 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sharpfield.core import Rays
+from sharpfield.core.rays import Rays
 from sharpfield.core.seed import generator
-from sharpfield.formation import (
-    FixedResponse,
-    LearnedResponse,
-    LogContrast,
-    LogResidual,
-    Pinhole,
-    RigidKernel,
-    RigidMotions,
-    Shutter,
-    SparseKernel,
-    SparsePoints,
-    gamma,
-)
+from sharpfield.core.tone import gamma
+from sharpfield.formation.events import LogContrast
+from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual
+from sharpfield.formation.rigid_kernel import RigidKernel, RigidMotions
+from sharpfield.formation.shutter import Pinhole, Shutter
+from sharpfield.formation.sparse_kernel import SparseKernel, SparsePoints
 from tests.formation.toy import CAMERA, lit, pairs, pixels, still, swaying, wall
 
 

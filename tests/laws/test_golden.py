@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from sharpfield.core.seed import generator
-from sharpfield.formation import FixedResponse, LearnedResponse, LogContrast, RigidMotions
+from sharpfield.formation.events import LogContrast
+from sharpfield.formation.response import FixedResponse, LearnedResponse
+from sharpfield.formation.rigid_kernel import RigidMotions
 from sharpfield.geometry import se3
-from sharpfield.losses import contrast_error
+from sharpfield.losses.events import contrast_error
 from tests.formation.toy import CAMERA, lit, pairs, still
 
 

@@ -5,11 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from sharpfield.captures import read, write, write_evdnerf
-from sharpfield.ops.event_index import build, signed_sum
-from sharpfield.simulation import Rig, Timing, moving_scene, ring, simulate_moving
-from sharpfield.simulation.cameras import RING_FOCAL
-from sharpfield.simulation.scenes import Scene
+from sharpfield.captures.native.layout import write
+from sharpfield.captures.read import read
+from sharpfield.captures.writers import evdnerf as write_evdnerf
+from sharpfield.events.index import build, signed_sum
+from sharpfield.simulation.cameras.rigs import RING_FOCAL, ring
+from sharpfield.simulation.scenes.moving import moving_scene
+from sharpfield.simulation.scenes.static import Scene
+from sharpfield.simulation.simulate import Rig, Timing
+from sharpfield.simulation.simulate_moving import simulate_moving
 
 RIG = Rig((24, 24), focal_of_width=RING_FOCAL)
 TIMING = Timing(frames=5, exposure_us=0, interval_us=40_000, step_us=2_000, test_every=2)

@@ -11,12 +11,19 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.draw import draw_pairs, draw_pixels, pair_table, pixel_table
-from sharpfield.core import Capture, Radiance, Rays
-from sharpfield.formation import FixedResponse, FixedThresholds, LogContrast, Shutter, tone_of
-from sharpfield.losses import mse
-from sharpfield.ops.event_index import build
-from sharpfield.simulation import EventSensor, Rig, Timing, scene, simulate
+from sharpfield.core.capture import Capture
+from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.tone import tone_of
+from sharpfield.events.index import build
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.formation.events import LogContrast
+from sharpfield.formation.response import FixedResponse
+from sharpfield.formation.shutter import Shutter
+from sharpfield.losses.photometric import mse
+from sharpfield.sampling.pixels_and_pairs import draw_pairs, draw_pixels, pair_table, pixel_table
+from sharpfield.simulation.scenes.static import scene
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 
 SENSOR = EventSensor(threshold_on=0.25, threshold_off=0.15)
 RIG = Rig(size=(30, 20), event_sensor=SENSOR)

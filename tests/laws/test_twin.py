@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.evaluation.event_frames import count_events
-from sharpfield.evaluation.event_twin import EventTwin, Pace, light_of, on_path, on_track
-from sharpfield.simulation import EventSensor
+from sharpfield.report.event_frames import count_events
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.twin.twin import EventTwin, Pace, light_of, on_path, on_track
 from tests.recipes.moving import tiny_moving
 from tests.recipes.test_evdnerf_physical import SMALL, learned
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from sharpfield.core.errors import ShapeError
-from sharpfield.losses import BAYER_WEIGHTS, contrast_error, silence_error
+from sharpfield.losses.events import BAYER_WEIGHTS, contrast_error, silence_error
 
 
 def test_nothing_is_lost_where_they_agree():

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sharpfield.losses import mse
+from sharpfield.losses.photometric import mse
 
 
 def test_nothing_is_lost_where_they_agree():

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sharpfield.losses import alignment, smoothness
+from sharpfield.losses.regularizers import alignment, smoothness
 
 
 def slow_variation(grid: torch.Tensor) -> float:

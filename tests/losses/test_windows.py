@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sharpfield.losses.windows import counted_error, dead_zone_error, exact_error, scaled_error
+from sharpfield.losses.events import counted_error, dead_zone_error, exact_error, scaled_error
 
 C = 0.2
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sharpfield.metrics import relative_count_error
+from sharpfield.metrics.image import relative_count_error
 
 MEASURED = torch.tensor([[[3.0, 0.0], [1.0, 4.0]]])
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from sharpfield.core.errors import ShapeError
-from sharpfield.metrics import psnr, ssim, ssim_paper, ssim_uniform
+from sharpfield.metrics.image import psnr, ssim, ssim_paper, ssim_uniform
 
 SSIMS = [ssim, ssim_uniform, ssim_paper]
 

@@ -9,8 +9,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from sharpfield.core.errors import OptionError, ShapeError
-from sharpfield.metrics import Lpips, load_lpips
-from sharpfield.metrics.lpips import BACKBONES
+from sharpfield.metrics.lpips import BACKBONES, Lpips, load_lpips
 
 
 def backbone_layers(network: str) -> nn.Sequential:

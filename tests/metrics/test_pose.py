@@ -5,7 +5,7 @@ import torch
 
 from sharpfield.core.errors import ShapeError
 from sharpfield.geometry.se3 import compose, exp
-from sharpfield.metrics import absolute_error, align, relative_error
+from sharpfield.metrics.pose import absolute_error, align, relative_error
 
 
 def path(count: int = 12) -> torch.Tensor:

@@ -5,9 +5,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.metrics.event_blur import event_blur
-from sharpfield.metrics.overlap import Overlap, depth_overlap, flow_overlap
 from sharpfield.metrics.quality import (
     Comparison,
     bending,
@@ -20,7 +19,8 @@ from sharpfield.metrics.quality import (
     reconciled,
     window_weights,
 )
-from sharpfield.preparation.quality_report import rank_correlation
+from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
+from sharpfield.preparation.quality import rank_correlation
 from sharpfield.simulation.simulate import Rig
 from sharpfield.simulation.simulate_room import RoomTiming, simulate_room
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.metrics import gradient_energy, laplacian_variance, luma
+from sharpfield.metrics.image import gradient_energy, laplacian_variance, luma
 
 
 def noise(channels: int = 3) -> torch.Tensor:

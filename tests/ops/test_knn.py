@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sharpfield.core import OptionError
+from sharpfield.core.errors import OptionError
 from sharpfield.ops._dispatch import using
 from sharpfield.ops.knn import BRICK, first_near, neighbours, sort_into_cells, window
 

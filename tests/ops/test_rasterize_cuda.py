@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.core import MissingExtra, OptionError
+from sharpfield.core.errors import MissingExtra, OptionError
 from sharpfield.ops import _dispatch
 from sharpfield.ops import rasterize as definition
 from sharpfield.ops._dispatch import using

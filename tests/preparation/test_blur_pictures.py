@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError
-from sharpfield.preparation.blur_pictures import blur_pictures
-from sharpfield.simulation.motion_kernel import KernelRange
+from sharpfield.core.errors import CaptureError
+from sharpfield.preparation.quality import blur_pictures
+from sharpfield.simulation.sensors.motion_kernel import KernelRange
 from sharpfield.storage.images import read_image, write_image
 
 

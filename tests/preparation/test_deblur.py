@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import Capture, CaptureError, EventStream, Exposure, OptionError, Split
-from sharpfield.preparation import (
-    DeblurOptions,
-    EventMotion,
-    deblur,
-    deblur_to,
-    find_thresholds,
-)
-from sharpfield.simulation import EventSensor, Rig, Timing, simulate
+from sharpfield.core.capture import Capture, Split
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.events import EventStream
+from sharpfield.core.frames import Exposure
+from sharpfield.events.motion import EventMotion
+from sharpfield.preparation.deblur import DeblurOptions, deblur, deblur_to
+from sharpfield.preparation.thresholds import find_thresholds
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.images import read_image
 
 THRESHOLD = 0.2

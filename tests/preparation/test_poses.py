@@ -9,23 +9,24 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures import native, read
-from sharpfield.captures.pose_layouts import OuterPath
-from sharpfield.cli.poses_command import Elsewhere
-from sharpfield.cli.poses_command import poses as poses_command
-from sharpfield.core import Capture, CaptureError, OptionError
-from sharpfield.core.errors import MissingExtra
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.paths.pose_layouts import OuterPath
+from sharpfield.captures.read import read
+from sharpfield.cli.poses import Elsewhere
+from sharpfield.cli.poses import poses as poses_command
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, MissingExtra, OptionError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Still
 from sharpfield.metrics.pose import absolute_error, align
-from sharpfield.preparation import poses_mapping
-from sharpfield.preparation.poses_external import Mount, attach, known_at
-from sharpfield.preparation.poses_find import PoseOptions, PosesFound, find_poses
-from sharpfield.preparation.poses_path import carried_on
-from sharpfield.preparation.poses_pictures import sharp_pictures
-from sharpfield.preparation.poses_report import as_text, summary
-from sharpfield.simulation import Rig, Timing, simulate
-from sharpfield.simulation.motion import motion
+from sharpfield.preparation.poses import mapping as poses_mapping
+from sharpfield.preparation.poses.external import Mount, attach, known_at
+from sharpfield.preparation.poses.find import PoseOptions, PosesFound, find_poses
+from sharpfield.preparation.poses.images import sharp_pictures
+from sharpfield.preparation.poses.path import carried_on
+from sharpfield.preparation.poses.report import as_text, summary
+from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.simulate import Rig, Timing, simulate
 
 BLURBALL = Path(__file__).parents[2].parent / "shared" / "data" / "posed" / "deblurnerf_blurball"
 

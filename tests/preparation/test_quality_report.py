@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from sharpfield.core import OptionError, Split
-from sharpfield.preparation.quality_report import (
+from sharpfield.core.capture import Split
+from sharpfield.core.errors import OptionError
+from sharpfield.preparation.quality import (
     QualityOptions,
     as_table,
     judged,

@@ -4,9 +4,10 @@ import functools
 
 import numpy as np
 
-from sharpfield.core import Camera, Capture, Clock, Exposure, Frames, Split
-from sharpfield.core.depth import DepthMaps
-from sharpfield.geometry import Still
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.frames import DepthMaps, Exposure, Frames
+from sharpfield.geometry.trajectory import Still
 
 SIZE = np.array([4.0, 3.0, 5.0])
 

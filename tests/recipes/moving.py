@@ -4,7 +4,8 @@ from dataclasses import replace
 from functools import cache
 
 from sharpfield.core.capture import Capture
-from sharpfield.simulation import MOVING_RIG, MOVING_TIMING, ring, simulate_moving
+from sharpfield.simulation.cameras.rigs import ring
+from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
 
 
 @cache

@@ -5,7 +5,7 @@ import torch
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.seed import numpy_generator
-from sharpfield.recipes.pictures import Pictures
+from sharpfield.initialisation.posed_images import Pictures
 
 CAMERA = Camera(120, 90, 110.0, 110.0, 60.0, 45.0)
 NEAR_WALL, FAR_WALL, EDGE = 3.0, 5.0, 0.0

@@ -3,8 +3,9 @@
 import torch
 
 from sharpfield.recipes.d_nerf import DNeRF
-from sharpfield.recipes.warped_scene import WarpedOptions
-from sharpfield.training import adam, fit
+from sharpfield.recipes.volume.warped_scene import WarpedOptions
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving
 
 SMALL = DNeRF(

@@ -9,11 +9,13 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes import EvDeblurNeRF, NeRF
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
+from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.presets import SIZES, VARIANTS, prepared
-from sharpfield.recipes.volume import VolumeOptions
+from sharpfield.recipes.volume.scene import VolumeOptions
 from sharpfield.rendering.view import render_view
-from sharpfield.training import adam, fit
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
 
 SMALL = VolumeOptions(
     voxels=(12**3, 16**3),

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures import event_index
 from sharpfield.fields.space_time import SpaceTimeSize
-from sharpfield.geometry.centred import centred
+from sharpfield.geometry.normalise import centred
+from sharpfield.initialisation.visual_hull import hull, silhouettes
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
-from sharpfield.recipes.moving import MovingOptions
-from sharpfield.recipes.swept import hull, silhouettes
-from sharpfield.simulation import MOVING_RIG, MOVING_TIMING, ring, simulate_moving
-from sharpfield.simulation.cameras import hand_held
+from sharpfield.recipes.volume.voxel_scene import MovingOptions
+from sharpfield.simulation.cameras.rigs import hand_held, ring
+from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
+from sharpfield.storage.event_cache import event_index
 from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving
 

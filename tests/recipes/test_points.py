@@ -10,17 +10,23 @@ import pytest
 import torch
 from torch import nn
 
-from sharpfield.core import Capture, Growing, Model, OptionError
-from sharpfield.fields.point_networks import PointSizes
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.protocols import Growing, Model
+from sharpfield.fields.points.networks import PointSizes
+from sharpfield.initialisation.point_cloud import CloudOptions, first_cameras, typical_spacing
 from sharpfield.recipes.hybrid import BlurOptions, Hybrid
-from sharpfield.recipes.image_sources import SourceOptions, nearest_in_order
-from sharpfield.recipes.point_growth import GrowthOptions
-from sharpfield.recipes.point_model import DrawOptions, PointModel
 from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.point_scene import MarchOptions
-from sharpfield.recipes.point_start import CloudOptions, first_cameras, typical_spacing
+from sharpfield.recipes.points.growth import GrowthOptions
+from sharpfield.recipes.points.images import SourceOptions, nearest_in_order
+from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.scene import MarchOptions
 from sharpfield.rendering.view import render_view
-from sharpfield.training import Options, adam, file_of, fit, train
+from sharpfield.training.checkpoint import file_of
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
+from sharpfield.training.plan import Options
+from sharpfield.training.train import train
 from tests.recipes.box import box
 from tests.training.toy import quiet
 

@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import torch
 
-from sharpfield.core import Capture
-from sharpfield.formation import FixedResponse
-from sharpfield.recipes import EvDeblurNeRF
+from sharpfield.core.capture import Capture
+from sharpfield.formation.response import FixedResponse
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.presets import blender_full, blender_minus, cdavis_full
-from sharpfield.recipes.volume import VolumeOptions
+from sharpfield.recipes.volume.scene import VolumeOptions
 
 TINY = VolumeOptions(
     voxels=(4**3, 6**3),

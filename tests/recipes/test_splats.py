@@ -9,29 +9,29 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core import (
-    Camera,
-    Capture,
-    CaptureError,
-    Growing,
-    Instants,
-    Model,
-    OptionError,
-    Pixels,
-    Rays,
-)
-from sharpfield.core.views import Views
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.measurements import Instants, Pixels
+from sharpfield.core.protocols import Growing, Model
+from sharpfield.core.rays import Rays, Views
 from sharpfield.formation.mix import mix
-from sharpfield.geometry import Still
 from sharpfield.geometry.rolling import Rolling
+from sharpfield.geometry.trajectory import Still
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.looks import LookOptions
-from sharpfield.recipes.splat_model import SplatModel
-from sharpfield.recipes.splat_scene import GaussianOptions
-from sharpfield.recipes.unknowns import UnknownOptions
+from sharpfield.recipes.splats.learned_calibration import UnknownOptions
+from sharpfield.recipes.splats.model import SplatModel
+from sharpfield.recipes.splats.scene import GaussianOptions
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
-from sharpfield.simulation import EventSensor, FrameSensor, Rig, Timing, simulate
-from sharpfield.training import Options, adam, file_of, fit, train
+from sharpfield.sampling.views import LookOptions
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.sensors.frames import FrameSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.training.checkpoint import file_of
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
+from sharpfield.training.plan import Options
+from sharpfield.training.train import train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.core import EventStream
-from sharpfield.recordings import Frame, Recording, Triggers
+from sharpfield.core.events import EventStream
+from sharpfield.recordings.recording import Frame, Recording, Triggers
 from tests.streams import HEIGHT, WIDTH, random_events
 
 START_US = 1_589_163_147_000_000

@@ -3,8 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, EventStream
-from sharpfield.recordings import Recording
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.recordings.recording import Recording
 from tests.recordings import fuzz
 from tests.streams import random_events
 

@@ -3,7 +3,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.open import FORMATS, Told, format_of, open_events, open_recording
-from sharpfield.storage import write_events
+from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.images import write_image
 from tests.streams import HEIGHT, WIDTH, random_events
 

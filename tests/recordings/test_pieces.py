@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError
-from sharpfield.recordings import Recording, Trouble
-from sharpfield.recordings.pieces import CHUNK, Piece, joined, known_size
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.chunks import CHUNK, Piece, joined, known_size
+from sharpfield.recordings.recording import Recording, Trouble
 
 SIZE = (12, 10)
 

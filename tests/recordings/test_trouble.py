@@ -7,19 +7,15 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.recordings import FORMATS, Recording, Told, Trouble, open_recording
+from sharpfield.recordings.open import FORMATS, Told, open_recording
+from sharpfield.recordings.recording import Recording, Trouble
 from sharpfield.storage.images import write_image
-from tests.recordings import (
-    fuzz,
-    test_aedat2,
-    test_aedat3,
-    test_aedat4,
-    test_dat,
-    test_evt,
-    test_nmnist,
-    test_rosbag,
-)
-from tests.recordings.test_text import rpg_lines
+from tests.recordings import fuzz
+from tests.recordings.aedat import test_aedat2, test_aedat3, test_aedat4
+from tests.recordings.prophesee import test_dat, test_evt
+from tests.recordings.ros import test_recording as test_rosbag
+from tests.recordings.tables import test_nmnist
+from tests.recordings.tables.test_text import rpg_lines
 from tests.recordings.test_video import video
 from tests.streams import HEIGHT, WIDTH, random_events
 

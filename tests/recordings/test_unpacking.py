@@ -2,7 +2,7 @@ import bz2
 
 import pytest
 
-from sharpfield.recordings.unpacking import Damaged, unpacked
+from sharpfield.recordings.bytes import Damaged, unpacked
 
 DATA = bytes(range(256)) * 100
 
@@ -18,7 +18,7 @@ def packed(packing: str) -> bytes:
 @pytest.mark.parametrize("packing", ["bz2", "lz4", "zstd"])
 def test_blocks(packing: str, monkeypatch) -> None:
     assert unpacked(packed(packing), packing) == DATA
-    monkeypatch.setattr("sharpfield.recordings.unpacking.PORTION", 1000)
+    monkeypatch.setattr("sharpfield.recordings.bytes.PORTION", 1000)
     assert unpacked(packed(packing), packing) == DATA
     assert unpacked(DATA, "none") is DATA
 
@@ -29,7 +29,7 @@ def test_damage(packing: str, monkeypatch) -> None:
     for broken in (b"", data[:3], data[: len(data) // 2], b"x" + data):
         with pytest.raises(Damaged):
             unpacked(broken, packing)
-    monkeypatch.setattr("sharpfield.recordings.unpacking.LIMIT", len(DATA) - 1)
+    monkeypatch.setattr("sharpfield.recordings.bytes.LIMIT", len(DATA) - 1)
     with pytest.raises(Damaged, match="grows without end"):
         unpacked(data, packing)
 

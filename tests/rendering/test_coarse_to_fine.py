@@ -6,9 +6,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from sharpfield.core import Camera, Radiance, Rays
+from sharpfield.core.camera import Camera
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
-from sharpfield.geometry import Frustum, Metric, cast
+from sharpfield.geometry.cast import cast
+from sharpfield.geometry.space import Frustum, Metric
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
 

@@ -5,7 +5,7 @@ import torch
 from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Rays
 from sharpfield.core.seed import generator
-from sharpfield.fields.voxel_grid import VoxelGrid
+from sharpfield.fields.voxels import VoxelGrid
 from sharpfield.geometry.space import Frustum, Metric
 from sharpfield.rendering.march import EvenSteps
 

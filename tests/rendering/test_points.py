@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from sharpfield.core import Rays
+from sharpfield.core.rays import Rays
 from sharpfield.ops.knn import first_near, neighbours, sort_into_cells
 from sharpfield.rendering.points import Asked, PointMarch
 

@@ -6,10 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.core import Camera, Radiance, Rays, Views
+from sharpfield.core.camera import Camera
+from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.seed import generator
-from sharpfield.fields import Gaussians
-from sharpfield.formation import Shutter, mix, tone_of
+from sharpfield.core.tone import tone_of
+from sharpfield.fields.gaussians.static import Gaussians
+from sharpfield.formation.mix import mix
+from sharpfield.formation.shutter import Shutter
 from sharpfield.geometry import se3
 from sharpfield.rendering.splat import Cloud, Splatting, whole
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of

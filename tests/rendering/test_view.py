@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.core import Camera, Radiance, Rays
+from sharpfield.core.camera import Camera
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.geometry import se3
 from sharpfield.rendering.view import render_view
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.simulation import EventSensor, folder_footage, simulate_footage, video_footage
-from sharpfield.simulation.footage import Footage
+from sharpfield.simulation.footage import Footage, folder_footage, simulate_footage, video_footage
+from sharpfield.simulation.sensors.event_pixels import EventSensor
 
 
 def ramp(count: int) -> np.ndarray:

@@ -5,11 +5,11 @@ import pytest
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import checked
-from sharpfield.simulation import EventSensor, FrameSensor, Rig, Timing, simulate
-from sharpfield.simulation.event_sensor import LUMA
-from sharpfield.simulation.motion import Motion, motion
-from sharpfield.simulation.scenes import scene
-from sharpfield.simulation.simulate import pictures, view
+from sharpfield.simulation.cameras.motion import Motion, motion
+from sharpfield.simulation.scenes.static import scene
+from sharpfield.simulation.sensors.event_pixels import LUMA, EventSensor
+from sharpfield.simulation.sensors.frames import FrameSensor
+from sharpfield.simulation.simulate import Rig, Timing, pictures, simulate, view
 
 RIG = Rig((48, 32))
 SHORT = Timing(frames=9, exposure_us=20_000, interval_us=25_000, step_us=2500)

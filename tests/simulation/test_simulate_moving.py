@@ -5,14 +5,20 @@ import pytest
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import checked
-from sharpfield.geometry import Still, Tracks, count_tracks
-from sharpfield.ops.event_image import window_image
-from sharpfield.ops.event_index import build
-from sharpfield.simulation import EventSensor, Rig, Timing
-from sharpfield.simulation.cameras import RING_FOCAL, Standing, Views, hand_held, ring, ring_pose
-from sharpfield.simulation.event_sensor import LUMA
-from sharpfield.simulation.moving_scenes import ALONE, MOVING_SCENES, moving_scene
-from sharpfield.simulation.simulate import view
+from sharpfield.events.image import window_image
+from sharpfield.events.index import build
+from sharpfield.geometry.trajectory import Still, Tracks, count_tracks
+from sharpfield.simulation.cameras.rigs import (
+    RING_FOCAL,
+    Standing,
+    Views,
+    hand_held,
+    ring,
+    ring_pose,
+)
+from sharpfield.simulation.scenes.moving import ALONE, MOVING_SCENES, moving_scene
+from sharpfield.simulation.sensors.event_pixels import LUMA, EventSensor
+from sharpfield.simulation.simulate import Rig, Timing, view
 from sharpfield.simulation.simulate_moving import simulate_moving
 
 RIG = Rig((32, 32), focal_of_width=RING_FOCAL)

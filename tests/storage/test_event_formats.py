@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from sharpfield.captures.event_cache import read_events
 from sharpfield.core.errors import OptionError
-from sharpfield.recordings.evt import open_evt
+from sharpfield.recordings.prophesee.evt import open_evt
+from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_formats import FORMATS, exporting_events
 from sharpfield.storage.event_layouts import open_events
 

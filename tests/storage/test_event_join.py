@@ -4,10 +4,9 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.core import EventStream
-from sharpfield.storage import open_events, write_events
-from sharpfield.storage.event_join import join_events
-from sharpfield.storage.event_writer import ROWS, writing_events
+from sharpfield.core.events import EventStream
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import ROWS, join_events, write_events, writing_events
 from tests.streams import random_events
 
 

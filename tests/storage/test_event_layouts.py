@@ -2,8 +2,8 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures.event_cache import read_events
 from sharpfield.core.errors import CaptureError, MissingExtra
+from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_layouts import open_events
 
 SIZE = (12, 10)

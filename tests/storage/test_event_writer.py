@@ -4,10 +4,10 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures.event_cache import read_events
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.storage import event_layouts, event_writer
+from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events, writing_events
 

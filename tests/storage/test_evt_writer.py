@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core import CaptureError, EventStream, OptionError
-from sharpfield.recordings.evt import open_evt
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.events import EventStream
+from sharpfield.recordings.prophesee.evt import open_evt
 from sharpfield.storage import evt_writer
 from sharpfield.storage.evt_writer import ENCODINGS, writing_evt
 from tests.streams import random_events

@@ -8,7 +8,6 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from sharpfield.core.errors import RunError
-from sharpfield.training import adam, fit
 from sharpfield.training.checkpoint import (
     Progress,
     check_settings,
@@ -20,6 +19,8 @@ from sharpfield.training.checkpoint import (
     save_best,
     save_last,
 )
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 
 SETTINGS = {"recipe": "toy", "samples": (64, 128)}

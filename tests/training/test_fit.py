@@ -2,7 +2,8 @@ import itertools
 
 import torch
 
-from sharpfield.training import adam, fit
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 from rich.console import Console
 
-from sharpfield.training import adam
 from sharpfield.training import log as log_module
 from sharpfield.training.log import Log, LogLosses, Table
+from sharpfield.training.optim import adam
 from tests.training.toy import Toy, quiet
 
 

@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from sharpfield.core.schedule import Group, linear
-from sharpfield.training import adam, fit, set_rates
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam, set_rates
 from tests.training.toy import Toy
 
 

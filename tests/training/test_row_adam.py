@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from sharpfield.core.growth import Growth
-from sharpfield.ops.rows import take_rows
-from sharpfield.training.row_adam import TAKEN, RowAdam
+from sharpfield.core.points import Growth
+from sharpfield.ops.sparse_rows import take_rows
+from sharpfield.training.optim import TAKEN, RowAdam
 from sharpfield.training.surgery import rebuild
 
 

@@ -4,11 +4,22 @@ import pytest
 import torch
 from torch import nn
 
-from sharpfield.core import Growing, Growth, PointSet, RunError
-from sharpfield.core.growth import unchanged
-from sharpfield.training import Options, adam, fit, load, restore_weights, train
-from sharpfield.training.checkpoint import Progress, file_of, restore, save_last
+from sharpfield.core.errors import RunError
+from sharpfield.core.points import Growth, unchanged
+from sharpfield.core.protocols import Growing, PointSet
+from sharpfield.training.checkpoint import (
+    Progress,
+    file_of,
+    load,
+    restore,
+    restore_weights,
+    save_last,
+)
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
+from sharpfield.training.plan import Options
 from sharpfield.training.surgery import rebuild, resize
+from sharpfield.training.train import train
 from tests.training.growing import Blobs, GrowingToy
 from tests.training.toy import Toy, quiet
 

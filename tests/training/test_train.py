@@ -13,7 +13,10 @@ import torch
 from rich.console import Console
 
 from sharpfield.core.errors import RunError
-from sharpfield.training import Ledger, Options, file_of, load, read_ledger, train
+from sharpfield.training.checkpoint import file_of, load
+from sharpfield.training.plan import Options
+from sharpfield.training.record import Ledger, read_ledger
+from sharpfield.training.train import train
 from tests.training import toy
 from tests.training.toy import Toy, quiet, score
 

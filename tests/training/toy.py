@@ -14,11 +14,11 @@ from torch import Tensor, nn
 
 from sharpfield.core.measurements import Batch, Pixels
 from sharpfield.core.protocols import Model
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
-from sharpfield.training import Options, train
+from sharpfield.training.plan import Options
+from sharpfield.training.train import train
 
 
 class Toy(nn.Module):

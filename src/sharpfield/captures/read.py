@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sharpfield.captures import (
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts import (
     arkitscenes,
     colmap,
     d_nerf,
@@ -12,7 +13,6 @@ from sharpfield.captures import (
     evdnerf,
     event_nerf,
     llff_events,
-    native,
     nerf_synthetic,
     nerfstudio,
     robust_e_nerf,
@@ -20,8 +20,8 @@ from sharpfield.captures import (
     sens_file,
     seven_scenes,
 )
-from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.photos import Missing
+from sharpfield.captures.layouts._photos import Missing
+from sharpfield.captures.native import layout as native
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.storage.event_layouts import THRESHOLDS

@@ -1,8 +1,12 @@
-"""Arguments that several commands take, and how they are read."""
+"""Arguments that several commands take, and how they are read.
+
+The terminal as all commands use it.
+"""
 
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
 
 from sharpfield.core.errors import OptionError
 
@@ -22,3 +26,8 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and int(width) > 7 and int(height) > 7):
         raise OptionError("cannot read the size", got=text, do="give it like 240x160, at least 8x8")
     return int(width), int(height)
+
+
+def screen() -> Console:
+    """Where commands print; numbers in a text are not coloured."""
+    return Console(highlight=False)

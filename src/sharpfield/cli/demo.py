@@ -7,20 +7,19 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from sharpfield.captures import native
-from sharpfield.cli.arguments import Device, Size, parse_size
-from sharpfield.cli.runs import device_named, measure, open_run, start
-from sharpfield.cli.screen import screen
+from sharpfield.captures.native import layout as native
+from sharpfield.cli.arguments import Device, Size, parse_size, screen
 from sharpfield.core.capture import Capture
-from sharpfield.core.exposure import Exposure
-from sharpfield.core.frames import Frames
-from sharpfield.evaluation import markdown, methods_table
+from sharpfield.core.frames import Exposure, Frames
 from sharpfield.preparation.deblur import DeblurOptions, deblur
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.recipes.saved import Started
-from sharpfield.simulation import SENSORS, Rig, Timing, simulate
-from sharpfield.training import Options
+from sharpfield.report.tables import markdown, methods_table
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import device_named, measure, open_run, start
+from sharpfield.simulation.sensors.event_pixels import SENSORS
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.training.plan import Options
 
 STRONG_BLUR = Timing(exposure_us=80_000, interval_us=90_000)
 """Exposures in dim light."""

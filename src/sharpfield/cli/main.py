@@ -5,18 +5,18 @@ from collections.abc import Callable, Sequence
 
 import tyro
 
-from sharpfield.cli.blocks_command import blocks
-from sharpfield.cli.calibrate_command import calibrate
-from sharpfield.cli.capture_commands import deblur, footage, inspect, simulate
+from sharpfield.cli.blocks import blocks
+from sharpfield.cli.calibrate import calibrate
+from sharpfield.cli.captures import deblur, footage, inspect, simulate
 from sharpfield.cli.demo import demo
-from sharpfield.cli.doctor_command import doctor
-from sharpfield.cli.event_commands import events
-from sharpfield.cli.export_command import export
-from sharpfield.cli.ingest_command import ingest
-from sharpfield.cli.poses_command import poses
-from sharpfield.cli.quality_commands import blur, quality
-from sharpfield.cli.recipe_commands import recipes
-from sharpfield.cli.run_commands import evaluate, render, train
+from sharpfield.cli.doctor import doctor
+from sharpfield.cli.events import events
+from sharpfield.cli.export import export
+from sharpfield.cli.ingest import ingest
+from sharpfield.cli.poses import poses
+from sharpfield.cli.quality import blur, quality
+from sharpfield.cli.recipes import recipes
+from sharpfield.cli.runs import evaluate, render, train
 from sharpfield.core.errors import SharpfieldError
 
 COMMANDS: dict[str, Callable[..., None]] = {

@@ -1,202 +1,192 @@
-"""A run from the command line's point of view: start one, open one again, measure it."""
+"""Commands about runs: train one, measure one, render one."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
+import numpy as np
 import torch
-from rich.console import Console
+import tyro
+from rich.progress import track
+from tyro.conf import Positional
 
-from sharpfield.captures.blocks import blocks_of, limited, parsed
 from sharpfield.captures.read import read
-from sharpfield.cli.screen import progress_on
-from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError, OptionError, RunError
-from sharpfield.core.protocols import Model
-from sharpfield.evaluation import Measuring, Story, evaluate, validation, write_report
-from sharpfield.recipes.saved import Started, read_started, write_started
-from sharpfield.training import (
-    Ledger,
-    Options,
-    file_of,
-    load,
-    read_ledger,
-    require_unused,
-    restore_weights,
-    train,
-)
+from sharpfield.cli.arguments import Device, screen
+from sharpfield.core.errors import OptionError
+from sharpfield.evaluation.evaluate import Measuring
+from sharpfield.evaluation.paths import camera_path
+from sharpfield.evaluation.refine import Refinement, refine_poses
+from sharpfield.evaluation.report import flat
+from sharpfield.metrics.lpips import load_lpips
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
+from sharpfield.rendering.view import render_view, renderer_of
+from sharpfield.report.video import write_film
+from sharpfield.runs.config import Started
+from sharpfield.runs.run import Reading, device_named, measure, open_run, start
+from sharpfield.training.plan import Options
 
-STREAMS = ("frames", "events")
+EIGHT_BIT = 255
 
 
 @dataclass(frozen=True)
-class Reading:
-    """How to read a capture, where its layout is not to be believed."""
+class Choice:
+    """What of the recipe, and of the capture, is used."""
 
-    layout: str | None = None
-    """By default it is recognised."""
-    event_unit: str | None = None
-    """Unit of event times: ns, us, ms or s."""
-    missing: Literal["error", "skip"] | None = None
-    """What to do about images that are named but not there."""
-    encoding: str | None = None
-    """How stored values relate to light: linear, gamma2.2 or srgb."""
-    hold_out: str | None = None
-    """Frames to hold out: every:8, train:5, last:5 or none."""
-    threshold: float | None = None
-    """Contrast threshold of both signs."""
-    trust_pickle: bool = False
-    """Open pickled files, which may name programs to run; only arrays of numbers are built from
-    them, and anything else is refused."""
-
-    def given(self) -> dict[str, Any]:
-        """What was not left open."""
-        return {name: value for name, value in vars(self).items() if value not in (None, False)}
+    preset: str = ""
+    """Named settings, several with commas between them; `sharpfield recipes describe RECIPE` lists
+    them. Left out, they follow the capture and the machine."""
+    use: tuple[str, ...] = ("frames", "events")
+    """Streams of the capture to learn from."""
+    block: str = ""
+    """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
+    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
+    """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A trained run."""
-
-    started: Started
-    model: Any
-    capture: Capture
-    """All of it, or its block; also what the model did not use."""
-
-    @property
-    def seen(self) -> Capture:
-        """The capture in the model's world, also with frames that the model did not use."""
-        own: Capture = self.model.capture
-        if own.frames is not None:
-            return own
-        return replace(own, frames=self.capture.frames, split=self.capture.split)
+CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), Reading(), Refinement()
 
 
-def device_named(name: str) -> str:
-    """`auto` becomes cuda where there is one.
+def train(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    seed: int = 0,
+    device: Device = "auto",
+    choice: Choice = CHOICE,
+    options: Options = OPTIONS,
+    reading: Reading = READING,
+) -> None:
+    """Train a recipe on a capture.
 
-    Raises:
-        OptionError: cuda was asked for and is not there.
+    Args:
+        recipe: Its name; `sharpfield recipes` lists them.
+        capture: Folder of the capture.
+        out: Folder of the run.
+        seed: Of everything random.
+        device: Where to train.
+        choice: Presets, streams, single numbers.
+        options: How long, how often to save, how much memory.
+        reading: What to believe instead of the capture's layout.
     """
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise OptionError("there is no CUDA device", do="use --device cpu")
-    return name
+    console, where = screen(), device_named(device)
+    source = read(capture, **reading.given())
+    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = changed(made, choice.change)
+    where_from, given = str(capture.resolve()), reading.given()
+    started = Started(recipe, made, where_from, seed, choice.use, given, choice.block)
+    ledger = start(started, source, out, options, device=where, console=console)
+    if ledger.finished:
+        console.print(f"Done. `sharpfield evaluate {out}` measures it.")
 
 
-def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
-    """A capture with only some of its streams; without events, if its camera reported none.
-
-    Raises:
-        OptionError: A name is unknown.
-        CaptureError: Nothing is left.
-    """
-    if unknown := set(streams) - set(STREAMS):
-        raise OptionError("unknown stream", got=", ".join(unknown), do="use frames, events or both")
-    missing = {"frames": not capture.frames, "events": not capture.events}
-    left = [name for name in streams if not missing[name]]
-    if not left:
-        raise CaptureError(
-            f"the capture has no {' or '.join(streams)}", where=capture.name, do="use what it has"
-        )
-    return capture.without(frames="frames" not in left, events="events" not in left)
-
-
-def part_of(capture: Capture, block: str) -> Capture:
-    """The block of a capture that "2/4" names; all of it if nothing does."""
-    if not block:
-        return capture
-    index, count = parsed(block)
-    return limited(capture, blocks_of(capture, count)[index])
-
-
-def start(
-    started: Started,
-    capture: Capture,
-    run: Path,
-    options: Options,
-    *,
-    device: str,
-    console: Console,
-) -> Ledger:
-    """Train a recipe on a capture in a run folder, or go on with it."""
-    part = part_of(capture, started.block)
-    chosen = used(part, started.use)
-
-    def build(steps: int) -> Model:
-        return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
-
-    if not options.resume:
-        require_unused(run)
-        write_started(run, started)
-    return train(
-        build,
-        run,
-        options,
-        steps=started.recipe.steps,
-        settings=started.settings(),
-        validate=validation(part),
-        console=console,
-    )
-
-
-def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") -> Opened:
-    """A run with its trained weights.
+def evaluate(
+    run: Positional[Path],
+    capture: Path | None = None,
+    device: Device = "auto",
+    refine: bool = False,
+    refinement: Refinement = REFINEMENT,
+    train_views: int | None = None,
+    lpips_backbone: Path | None = None,
+    lpips_linear: Path | None = None,
+) -> None:
+    """Measure a run on held-out views; write metrics.json and report.html into it.
 
     Args:
         run: Folder that `train` made.
-        capture: Where the capture is now, if it moved; or another one of the same scene and clock.
-        device: Where the model goes.
+        capture: Where the capture is, if it moved.
+        device: Where to render.
+        refine: Refine the held-out poses first, with the scene frozen.
+        refinement: How, if so.
+        train_views: Most training views to render as well; by default all whose truth is known.
+        lpips_backbone: Weights file of torchvision's AlexNet or VGG16, to compute LPIPS.
+        lpips_linear: Weights file of LPIPS's own linear layers.
+    """
+    console = screen()
+    opened = open_run(run, capture=capture, device=device)
+    lpips = None
+    if lpips_backbone is not None and lpips_linear is not None:
+        lpips = load_lpips(lpips_backbone, lpips_linear)
+    volume = getattr(opened.started.recipe, "volume", None)
+    poses, stated = {}, {"near_plane_removal": getattr(volume, "clear_before", 0.0)}
+    if refine:
+        found = refine_poses(opened.model, opened.capture, how=refinement)
+        poses, stated = found.poses, {**stated, **found.protocol}
+    measuring = Measuring(train_views=train_views, lpips=lpips, poses=poses, stated=stated)
+    metrics = measure(opened, run, console, measuring=measuring)
+    mean = {name: value for name, value in metrics["mean"].items() if value is not None}
+    console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()))
+    console.print(f"The report is {run / 'report.html'}")
+
+
+def render(
+    run: Positional[Path],
+    out: Path,
+    path: str = "spiral",
+    pictures: int = 60,
+    rate: float = 30.0,
+    capture: Path | None = None,
+    device: Device = "auto",
+) -> None:
+    """Render a run along a camera path.
+
+    Args:
+        run: Folder that `train` made.
+        out: A film FILE.mp4, or a folder for PNGs.
+        path: spiral, train, or exposure:N for the inside of one exposure.
+        pictures: How many.
+        rate: Pictures per second of a film.
+        capture: Where the capture is, if it moved.
+        device: Where to render.
+    """
+    console = screen()
+    opened = open_run(run, capture=capture, device=device)
+    model = opened.model
+    where = device_named(device)
+    camera_moves = camera_path(opened.seen, path, pictures=pictures)
+
+    def rendered(number: int) -> np.ndarray:
+        pose = torch.from_numpy(camera_moves.poses[number]).to(where)
+        time = float(camera_moves.time[number])
+        seen = render_view(renderer_of(model), model.capture.camera, pose, time)
+        return eight_bit(model.develop(seen.rgb))
+
+    numbers = track(
+        range(len(camera_moves)), "rendering", console=console, disable=not console.is_terminal
+    )
+    count = write_film(out, (rendered(number) for number in numbers), rate=rate)
+    console.print(f"{count} pictures are in {out}")
+
+
+def eight_bit(picture: torch.Tensor) -> np.ndarray:
+    """Stored values 0...1 as bytes."""
+    return (picture.clamp(0, 1) * EIGHT_BIT).round().byte().cpu().numpy()
+
+
+def changed(recipe: Any, changes: tuple[str, ...]) -> Any:
+    """A recipe with some of its numbers changed by name.
 
     Raises:
-        RunError: The run has no checkpoint yet, or is damaged.
+        OptionError: A change is not NAME=VALUE, or the recipe has no such number.
     """
-    started, ledger = read_started(run), read_ledger(run)
-    if ledger is None:
-        raise RunError("this run has not begun", where=run, do="train it first")
-    source = Path(started.capture) if capture is None else capture
-    if not source.exists():
-        raise CaptureError(
-            "the capture of this run is gone",
-            where=run,
-            got=source,
-            do="say where it is now with --capture",
-        )
-    whole = part_of(read(source, **started.reading), started.block)
-    model = started.recipe.lasting(ledger.planned_steps).build(
-        used(whole, started.use), started.seed
+    known, words = set(flat(dataclasses.asdict(recipe))), []
+    for change in changes:
+        name, equals, value = change.partition("=")
+        if not equals or name not in known:
+            raise OptionError(
+                "cannot read a change of the recipe",
+                got=change,
+                do=f"write NAME=VALUE with one of {', '.join(sorted(known))}",
+            )
+        words += [f"--{name}", *value.split(",")]
+    if not words:
+        return recipe
+    # Without flags, so that a boolean takes its value like every other number: NAME=False.
+    return tyro.cli(
+        type(recipe),
+        prog="--change",
+        default=recipe,
+        args=words,
+        config=(tyro.conf.FlagConversionOff,),
     )
-    restore_weights(load(file_of(run, "last")), model)
-    return Opened(started, model.to(device_named(device)), whole)
-
-
-def measure(
-    opened: Opened,
-    run: Path,
-    console: Console,
-    *,
-    measuring: Measuring | None = None,
-    baselines: Mapping[str, Mapping[str, Any]] | None = None,
-    title: str = "",
-) -> dict[str, Any]:
-    """Evaluate a run and write its report."""
-    started = opened.started
-    with progress_on(console) as progress:
-        task = progress.add_task("rendering", total=None)
-        metrics = evaluate(
-            opened.model,
-            opened.capture,
-            run,
-            measuring=measuring,
-            baselines=baselines,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    story = Story(
-        title=title or f"{started.name} on {opened.capture.name}",
-        paper=started.recipe.paper,
-        settings=started.settings(),
-    )
-    write_report(run, opened.capture, metrics, story)
-    return metrics

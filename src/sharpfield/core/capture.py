@@ -10,10 +10,9 @@ from jaxtyping import Float, Int64, Shaped
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.depth import DepthMaps
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.core.frames import Frames
+from sharpfield.core.frames import DepthMaps, Frames
 from sharpfield.core.protocols import Trajectory
 
 HELD_BACK_US = 2

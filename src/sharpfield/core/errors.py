@@ -3,7 +3,12 @@
 Everything that comes from outside (files, the command line, a user's arrays) fails with one of
 these; the command line prints the message alone and exits with code 2. Truths internal to the
 program are plain assertions.
+
+Optional packages: imported where they are used, with an error that names the extra.
 """
+
+import importlib
+from types import ModuleType
 
 
 class SharpfieldError(Exception):
@@ -50,3 +55,22 @@ class MissingExtra(SharpfieldError):
             f"{purpose} needs the package {package!r}",
             do=f"pip install 'sharpfield[{extra}]'",
         )
+
+
+def need(package: str, *, extra: str, purpose: str) -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        package: Import name, e.g. `hdf5plugin`.
+        extra: The extra of `sharpfield` that installs it.
+        purpose: What the user was about to do, to begin the error message.
+
+    Raises:
+        MissingExtra: The package is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as missing:
+        if missing.name != package.partition(".")[0]:
+            raise
+        raise MissingExtra(package, extra=extra, purpose=purpose) from None

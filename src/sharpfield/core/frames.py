@@ -1,12 +1,81 @@
-"""Images on the capture's clock."""
+"""Images on the capture's clock.
+
+When the shutter was open.
+
+What a depth camera measured beside the frames: one map for each frame, on the same clock.
+
+Depth is along the camera's axis, at pixel centres. The depth camera may have fewer pixels than the
+frames and a lens of its own, but stands where the frame camera stands (data sets call that
+*registered*). Maps stay as sensors store them, 16 bit, so that they can be mapped from disk.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int64, Shaped, UInt8, UInt16
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.exposure import Exposure
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Opening and closing time of the shutter for each frame, in us on the capture's clock.
+
+    A frame with `open_us == close_us` is an instant: a sharp picture, as far as motion goes.
+    """
+
+    open_us: Int64[np.ndarray, "n"]
+    close_us: Int64[np.ndarray, "n"]
+    row_delay_us: float = 0.0
+    """Each row opens and closes this much later than the one above: a rolling shutter. Times are
+    those of the first row."""
+
+    def __post_init__(self) -> None:
+        wrong = np.flatnonzero(self.close_us < self.open_us)
+        if len(wrong):
+            i = wrong[0]
+            raise CaptureError(
+                "an exposure ends before it begins",
+                where=f"frame {i}",
+                got=f"opens at {self.open_us[i]} us, closes at {self.close_us[i]} us",
+                do="check the order of the two columns of exposure times",
+            )
+        if self.row_delay_us < 0:
+            raise CaptureError(
+                "rows of a rolling shutter must follow each other downwards",
+                got=f"a row delay of {self.row_delay_us:g} us",
+                do="turn frames and events upside down",
+            )
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.open_us)
+
+    @property
+    def middle_us(self) -> Int64[np.ndarray, "n"]:
+        """Middle of each exposure."""
+        return self.open_us + (self.close_us - self.open_us) // 2
+
+    @property
+    def duration_us(self) -> Int64[np.ndarray, "n"]:
+        """How long each shutter was open."""
+        return self.close_us - self.open_us
+
+    @property
+    def instant(self) -> Bool[np.ndarray, "n"]:
+        """Whether a frame was taken at one instant, free of motion blur by construction."""
+        return self.open_us == self.close_us
+
+    def readout_us(self, height: int) -> float:
+        """How much later the last of so many rows is exposed than the first."""
+        return self.row_delay_us * (height - 1)
+
+    def window(self, frame: int) -> tuple[int, int]:
+        """Opening and closing time of one frame, in us."""
+        return int(self.open_us[frame]), int(self.close_us[frame])
+
 
 ENCODINGS = ("linear", "gamma2.2", "srgb")
 """How stored values relate to light: not at all bent, by a power of 1/2.2, by the sRGB curve."""
@@ -98,3 +167,47 @@ class Frames:
                 got=f"one closes at {closes[i]} us, the next opens at {opens[i + 1]} us",
                 do="check the exposure times; a second camera is a second track",
             )
+
+
+MILLIMETRE = 0.001
+"""What one step of a stored depth means to most sensors, in metres."""
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """A measured depth map for each frame; unlike `Frames.depth`, which is the truth."""
+
+    stored: UInt16[np.ndarray, "n h w"]
+    """In steps of `unit`; 0 where nothing was measured."""
+    camera: Camera
+    """Lens and sensor of the depth camera."""
+    unit: float = MILLIMETRE
+    """World units in one step."""
+
+    def __post_init__(self) -> None:
+        if self.stored.shape[1:] != self.camera.size[::-1]:
+            raise CaptureError(
+                "depth maps and their camera have different sizes",
+                got=f"maps {self.stored.shape[2]}x{self.stored.shape[1]},"
+                f" camera {self.camera.width}x{self.camera.height}",
+                do="give the intrinsics of the depth camera",
+            )
+        if not self.unit > 0:
+            raise CaptureError("a step of depth must be positive", got=self.unit)
+
+    def __len__(self) -> int:
+        """Number of maps."""
+        return len(self.stored)
+
+    def at(self, frame: int) -> Float32[np.ndarray, "h w"]:
+        """Depth in world units seen by one frame; 0 where unknown."""
+        return np.asarray(self.stored[frame]).astype(np.float32) * np.float32(self.unit)
+
+    def rays(self) -> Float32[np.ndarray, "h w 3"]:
+        """Directions of all pixels in camera axes, with a z of 1: times depth, they are points."""
+        unit = self.camera.direction(self.camera.grid().double())
+        return (unit / unit[..., 2:]).to(torch.float32).numpy()
+
+
+LEAST_DEPTH = 1e-6
+"""Below this a stored depth means that nothing was measured."""

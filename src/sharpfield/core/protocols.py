@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_chec
 from jaxtyping import Float, Int64
 from torch import Generator, Tensor
 
-from sharpfield.core.growth import Growth
-from sharpfield.core.measurements import Batch
+from sharpfield.core.measurements import Batch, EventPairs
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.points import Growth
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
 
 if TYPE_CHECKING:
@@ -210,4 +209,13 @@ class Recipe(Protocol):
 
     def build(self, capture: "Capture", seed: int) -> Any:
         """A `Model` on one capture."""
+        ...
+
+
+@runtime_checkable
+class Response(Protocol):
+    """Linear light to the log of what an event pixel's photoreceptor reports."""
+
+    def __call__(self, light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b k 1"]:
+        """Natural log, one value for each ray."""
         ...

@@ -2,12 +2,15 @@
 
 Nothing in the project counts steps or touches the global generator, so what is drawn at step 700
 does not depend on how step 700 was reached, and resuming equals never having stopped.
+
+Some of many.
 """
 
 import hashlib
 
 import numpy as np
 import torch
+from jaxtyping import Shaped
 
 
 def number(seed: int, step: int, stream: str) -> int:
@@ -35,3 +38,15 @@ def generator(
 def numpy_generator(seed: int, step: int, stream: str) -> np.random.Generator:
     """The same for numpy."""
     return np.random.default_rng(number(seed, step, stream))
+
+
+def evenly_spread(rows: Shaped[np.ndarray, "n *_"], most: int) -> Shaped[np.ndarray, "m *_"]:
+    """At most `most` rows in their order, evenly spread: all, or the first, the last, and between.
+
+    Args:
+        rows: Of any kind.
+        most: How many; a single one is the first.
+    """
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]

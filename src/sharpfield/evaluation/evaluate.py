@@ -22,18 +22,17 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
+from sharpfield.evaluation.alignment_and_depth import aligned_psnr, depth_error, distances
 from sharpfield.evaluation.brightness import Brightness
 from sharpfield.evaluation.event_films import event_films
 from sharpfield.evaluation.event_scores import event_scores
-from sharpfield.evaluation.more_scores import aligned_psnr, depth_error, distances
-from sharpfield.evaluation.pictures import colour_depth, eight_bit
 from sharpfield.evaluation.protocol import describe
-from sharpfield.evaluation.reference import held_out, trained_on
 from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
-from sharpfield.evaluation.views import View, brightness_of, seen_at
-from sharpfield.metrics import Lpips, laplacian_variance
-from sharpfield.metrics.lpips import SMALLEST_PX
+from sharpfield.evaluation.views import View, brightness_of, held_out, seen_at, trained_on
+from sharpfield.metrics.image import laplacian_variance
+from sharpfield.metrics.lpips import SMALLEST_PX, Lpips
 from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, renderer_of
+from sharpfield.report.colormaps import colour_depth, eight_bit
 from sharpfield.storage.images import write_image
 
 METRICS = "metrics.json"

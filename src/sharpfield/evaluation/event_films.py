@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from sharpfield.captures import event_index
 from sharpfield.core.capture import Capture
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation import page
-from sharpfield.evaluation.event_frames import busy
 from sharpfield.evaluation.event_scores import log_view, recorded_counts, usual_threshold
-from sharpfield.evaluation.pictures import colour_signs
-from sharpfield.evaluation.tables import Table, as_html
-from sharpfield.evaluation.video import write_film
+from sharpfield.report import page
+from sharpfield.report.colormaps import colour_signs
+from sharpfield.report.event_frames import busy
+from sharpfield.report.tables import Table, as_html
+from sharpfield.report.video import write_film
+from sharpfield.storage.event_cache import event_index
 
 CAMERAS = 2
 """Most cameras that are filmed, evenly spread over those held out."""

@@ -16,14 +16,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.captures import event_index
 from sharpfield.core.capture import USUAL_THRESHOLD, Capture
+from sharpfield.core.device import device_of
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.device import device_of
-from sharpfield.metrics import luma, ssim
-from sharpfield.ops.event_image import window_image
-from sharpfield.ops.event_index import EventIndex
+from sharpfield.events.image import window_image
+from sharpfield.events.index import EventIndex
+from sharpfield.metrics.image import luma, ssim
 from sharpfield.rendering.view import render_view, renderer_of
+from sharpfield.storage.event_cache import event_index
 
 WINDOWS = 8
 """Windows of each camera, evenly spread."""

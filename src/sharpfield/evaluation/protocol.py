@@ -10,11 +10,10 @@ import torch
 
 import sharpfield
 from sharpfield.core.capture import Capture
-from sharpfield.evaluation import more_scores
-from sharpfield.evaluation.reference import Reference
+from sharpfield.evaluation import alignment_and_depth as more_scores
 from sharpfield.evaluation.scores import DEFINITIONS
-from sharpfield.metrics import Lpips
-from sharpfield.metrics.lpips import SMALLEST_PX
+from sharpfield.evaluation.views import Reference
+from sharpfield.metrics.lpips import SMALLEST_PX, Lpips
 
 ENABLE_LPIPS = (
     "give torchvision's AlexNet weights (alexnet-owt-7be5be79.pth) and the linear layers of LPIPS"

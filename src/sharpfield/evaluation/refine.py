@@ -25,14 +25,16 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
 from sharpfield.core.seed import numpy_generator
-from sharpfield.evaluation.device import device_of
-from sharpfield.evaluation.reference import held_out
-from sharpfield.geometry import cast, se3
+from sharpfield.evaluation.views import held_out
+from sharpfield.geometry import se3
+from sharpfield.geometry.cast import cast
 from sharpfield.geometry.rolling import Rolling, moved_rows
-from sharpfield.metrics import align, psnr
+from sharpfield.metrics.image import psnr
+from sharpfield.metrics.pose import align
 from sharpfield.rendering.splat import whole
 from sharpfield.rendering.view import CHUNK, ViewRenderer, render_view, renderer_of
 

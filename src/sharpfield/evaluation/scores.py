@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.metrics import Lpips, psnr, ssim, ssim_paper
+from sharpfield.metrics.image import psnr, ssim, ssim_paper
+from sharpfield.metrics.lpips import Lpips
 
 MEASURES = {"psnr": psnr, "ssim": ssim, "ssim_paper": ssim_paper}
 NAMES = (*MEASURES, "lpips")

@@ -1,20 +1,92 @@
-"""What a model renders where a frame was taken, beside what it should look like."""
+"""What a model renders where a frame was taken, beside what it should look like.
 
+What renders are compared with: sharp truth where it is known, else the stored image.
+
+A *held-out* frame is compared with its truth if the capture knows it, or with its own image. That
+image is sharp when it was taken in one instant; when it was exposed for a while it is blurred, and
+the reference says so, since a sharp render is then punished for being sharp.
+
+Where things are computed.
+
+A score of a model that is still being trained: a few held-out views, rendered now and then.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
+from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
+from sharpfield.core.frames import Frames
 from sharpfield.core.protocols import Model
+from sharpfield.core.seed import evenly_spread
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
-from sharpfield.evaluation.device import device_of
-from sharpfield.evaluation.reference import Reference
 from sharpfield.geometry.rolling import Rolling, moved_rows
+from sharpfield.metrics.image import psnr
 from sharpfield.rendering.view import CHUNK, Progress, render_view, renderer_of
+from sharpfield.report.colormaps import as_display
+
+TRUTH, SHARP, BLURRED = "truth", "sharp image", "blurred image"
+
+UNSCORED = 3
+"""Training views without truth that are rendered all the same, to look at."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A frame, and the picture a render from its mid-exposure pose should look like."""
+
+    frame: int
+    name: str
+    kind: str
+    """`truth`, `sharp image`, `blurred image`, or "" where there is nothing to compare with."""
+    image: Float[Tensor, "h w c"] | None
+    """Display domain, 0...1."""
+    measured: Float[Tensor, "h w c"]
+    """What the camera recorded, display domain, 0...1."""
+
+
+def held_out(capture: Capture) -> list[Reference]:
+    """References of the frames that were not trained on, in the order of the split."""
+    if capture.frames is None:
+        return []
+    return [_reference(capture.frames, int(i), own_image=True) for i in capture.split.test]
+
+
+def trained_on(capture: Capture, *, limit: int | None = None) -> list[Reference]:
+    """References of training frames whose sharp truth is known; if none is, a few without one.
+
+    Args:
+        capture: With or without frames.
+        limit: Most frames to return, evenly spread; None for all.
+    """
+    frames = capture.frames
+    if frames is None:
+        return []
+    chosen = capture.split.train[frames.with_truth[capture.split.train]]
+    if len(chosen):
+        chosen = evenly_spread(chosen, len(chosen) if limit is None else limit)
+    else:
+        chosen = evenly_spread(
+            capture.split.train, UNSCORED if limit is None else min(limit, UNSCORED)
+        )
+    return [_reference(frames, int(i), own_image=False) for i in chosen]
+
+
+def _reference(frames: Frames, i: int, *, own_image: bool) -> Reference:
+    measured = as_display(frames.images[i])
+    if frames.truth is not None and frames.with_truth[i]:
+        return Reference(i, frames.names[i], TRUTH, as_display(frames.truth[i]), measured)
+    if not own_image:
+        return Reference(i, frames.names[i], "", None, measured)
+    kind = SHARP if frames.exposure.instant[i] else BLURRED
+    return Reference(i, frames.names[i], kind, measured, measured)
 
 
 @dataclass(frozen=True)
@@ -96,3 +168,35 @@ def brightness_of(model: Model, views: list[View], *, blind: bool | None = None)
     if not blind or events is None:
         return Brightness(develop, grey=any(image.shape[-1] == 1 for _, image in compared))
     return fit_brightness(develop, compared, grey=not events.coloured)
+
+
+VIEWS = 2
+"""Held-out views that are rendered."""
+
+
+def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], float] | None:
+    """What tells the mean PSNR of some held-out views of a model, as `evaluate` measures it.
+
+    Args:
+        capture: What the model learns from, with its held-out frames, as read.
+        views: How many; the same ones every time, evenly spread.
+
+    Returns:
+        The score; None where there is no picture to compare with.
+    """
+    known = [reference for reference in held_out(capture) if reference.image is not None]
+    if not known:
+        return None
+    chosen = [known[i] for i in evenly_spread(np.arange(len(known)), views)]
+
+    def mean_psnr(model: Model) -> float:
+        seen = [seen_at(model, reference, capture) for reference in chosen]
+        brightness = brightness_of(model, seen)
+        scores = [
+            psnr(brightness.picture(view.light), brightness.reference(image))
+            for view in seen
+            if (image := view.reference.image) is not None
+        ]
+        return float(sum(scores)) / len(scores)
+
+    return mean_psnr

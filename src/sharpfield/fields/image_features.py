@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.seed import generator
-from sharpfield.ops.leaky import GAIN, LeakyLayers, leaky, xavier
+from sharpfield.ops.dense import GAIN, LeakyLayers, leaky, xavier
 
 MAPS = (6, 12, 24)
 """Channels of the three maps."""

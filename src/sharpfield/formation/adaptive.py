@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint  # pyright: ignore[reportUnknownVariableType]
 
-from sharpfield.core.radiance import Samples
+from sharpfield.core.rays import Samples
 from sharpfield.ops.dense import Dense, linear
 from sharpfield.ops.encoding import frequencies, frequencies_width
 

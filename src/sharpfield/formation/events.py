@@ -15,11 +15,9 @@ from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.measurements import EventPairs
-from sharpfield.core.protocols import Trajectory
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.protocols import Response, Trajectory
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.formation.mix import mix
-from sharpfield.formation.response import Response
 from sharpfield.geometry.cast import cast
 
 

@@ -7,21 +7,12 @@ then a way to choose rays and weights (*expose*) and two curves: `inner` acts on
 ray, `outer` on their sum.
 """
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.core.radiance import Radiance
-
-Curve = Callable[[Tensor], Tensor]
-"""Light in, something else out; one value at a time, or the channels of one ray at a time."""
-
-
-def identity(light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-    """Light as it is."""
-    return light
+from sharpfield.core.rays import Radiance
+from sharpfield.core.tone import Curve, identity
 
 
 def mix(

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.seed import generator
-from sharpfield.ops.leaky import LeakyLayers
+from sharpfield.ops.dense import LeakyLayers
 from sharpfield.ops.patch import best_match, convolve, convolve_all
 
 PARTS, FINE = 32, 1024

@@ -19,9 +19,9 @@ from torch import Tensor, nn
 from sharpfield.core.camera import Camera
 from sharpfield.core.measurements import Pixels
 from sharpfield.core.protocols import Trajectory
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
-from sharpfield.formation.mix import Curve, identity, mix
+from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.tone import Curve, identity
+from sharpfield.formation.mix import mix
 from sharpfield.geometry import se3
 from sharpfield.geometry.cast import cast
 from sharpfield.ops.dense import Dense, FrameVectors

@@ -1,4 +1,11 @@
-"""A capture in a space of its own: near things 4/3 away, the average camera at the origin."""
+"""A capture in a space of its own: near things 4/3 away, the average camera at the origin.
+
+A capture seen from its middle: what the cameras look at lies in a box from -1 to 1.
+
+For cameras all around a scene, whose average pose means little.
+
+The point that cameras look at.
+"""
 
 import dataclasses
 
@@ -7,9 +14,35 @@ import torch
 from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
-from sharpfield.geometry.shake import LearnedShake
 from sharpfield.geometry.space import Similarity, normalisation
-from sharpfield.geometry.trajectory import LearnedKnots, Moved, Stamped, Tracks, count_tracks
+from sharpfield.geometry.trajectory import (
+    LearnedKnots,
+    LearnedShake,
+    Moved,
+    Stamped,
+    Tracks,
+    count_tracks,
+)
+
+PARALLEL = 1e-3
+"""Mean squared sine of the angles between optical axes, below which they meet nowhere."""
+
+
+def focus(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"] | None:
+    """The point nearest to all optical axes, in the least-squares sense.
+
+    None if the axes are nearly parallel, or if most cameras look away from it.
+    """
+    centre, forward = poses[:, :, 3], poses[:, :, 2]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # removes what is along an axis
+    system = across.mean(0)
+    if np.linalg.eigvalsh(system)[0] < PARALLEL:
+        return None
+    right = (across @ centre[..., None]).mean(0)[:, 0]
+    point = np.asarray(np.linalg.solve(system, right), np.float64)  # pyright: ignore
+    before = ((point - centre) * forward).sum(-1) > 0
+    return point if before.mean() > 0.5 else None
+
 
 REFERENCE = "reference_poses"
 """Note of a capture that says which poses its normalisation is taken over."""
@@ -80,3 +113,23 @@ def change_of(capture: Capture) -> Similarity:
     if isinstance(path, Moved):
         return path.change
     return Similarity(1.0, np.eye(3), np.zeros(3))
+
+
+def centred(capture: Capture) -> tuple[Capture, Similarity]:
+    """The capture in a world whose box from -1 to 1 holds what its cameras look at.
+
+    The box is as wide as what a camera sees around the point that all look at, and nothing of it is
+    nearer than the capture's nearest depth. Where there is no such point, it is the one half way
+    between the nearest and the farthest depth.
+    """
+    poses = reference_poses(capture)
+    centre, forward = poses[:, :, 3], poses[:, :, 2]
+    point = focus(poses)
+    if point is None:
+        point = (centre + (capture.near + capture.far) / 2 * forward).mean(0)
+    distance = float(np.linalg.norm(centre - point, axis=1).mean())
+    camera = capture.camera
+    seen = distance * max(camera.width / camera.fx_px, camera.height / camera.fy_px) / 2
+    half = min(seen, max(distance - capture.near, 0.1 * distance))
+    change = Similarity(1 / half, np.eye(3), -point / half)
+    return moved(capture, change), change

@@ -10,6 +10,13 @@ give *different numbers for the same pictures*, so a table has to say which one 
 - `ssim_paper`: the numbers printed by NeRF deblurring papers (Deblur-NeRF, DP-NeRF, PDRF,
   Ev-DeblurNeRF): as `ssim_uniform`, but of pictures mapped to -1...1 with range 2. Local means then
   lie around zero, and its luminance term punishes grey regions; it is often much lower.
+
+How sharp a picture is, without another to compare it to.
+
+Both numbers grow with contrast and noise as well as with sharpness, so they order pictures of the
+same scene under the same light, and mean nothing on their own.
+
+How well predicted events match measured ones, by their numbers at each pixel.
 """
 
 import torch
@@ -101,3 +108,47 @@ def _same_shape(predicted: Picture, truth: Picture) -> None:
             "pictures to compare have different shapes",
             got=f"{tuple(predicted.shape)} and {tuple(truth.shape)}",
         )
+
+
+REC601 = (0.299, 0.587, 0.114)
+
+
+def luma(picture: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+    """Brightness of display values: Rec. 601 for three channels, the channel itself for one."""
+    if picture.shape[-1] == 1:
+        return picture[..., 0]
+    return picture @ picture.new_tensor(REC601)
+
+
+def laplacian_variance(picture: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Variance of the Laplacian (four neighbours) of the luma, inside the border.
+
+    Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
+    """
+    grey = luma(picture).double()
+    middle = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * middle
+    return laplacian.var(correction=0)
+
+
+def gradient_energy(picture: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+    """Mean squared length of the gradient of the luma, per pixel, by forward differences."""
+    grey = luma(picture).double()
+    right = grey[:-1, 1:] - grey[:-1, :-1]
+    down = grey[1:, :-1] - grey[:-1, :-1]
+    return torch.mean(right.square() + down.square())
+
+
+def relative_count_error(
+    predicted: Float[Tensor, "*b h w"], measured: Float[Tensor, "*b h w"]
+) -> Float[Tensor, ""]:
+    """Absolute differences of event counts as a share of all measured events.
+
+    0 is perfect; 1 is what predicting no event at all gets. Infinite if nothing was measured.
+
+    Args:
+        predicted: Number of events at each pixel; give signs and time windows as leading axes,
+            or errors of opposite sign hide each other.
+        measured: The same for the recording.
+    """
+    return (predicted - measured).abs().sum() / measured.sum()

@@ -27,7 +27,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Frames
 from sharpfield.metrics.event_blur import event_blur
-from sharpfield.metrics.overlap import Overlap, depth_overlap, flow_overlap
+from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
 
 WIDTH = 640
 """Pictures are compared at this width, in px."""

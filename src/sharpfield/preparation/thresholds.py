@@ -9,19 +9,19 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.selection import evenly_spread
-from sharpfield.formation.edi import latent
-from sharpfield.formation.edi_threshold import (
+from sharpfield.core.seed import evenly_spread
+from sharpfield.core.tone import Tone, tone_of
+from sharpfield.events.edi import latent
+from sharpfield.events.motion import EventMotion
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import (
     best_threshold,
     best_thresholds,
     disagreement,
     distance_from_usual,
     edge_density,
 )
-from sharpfield.formation.event_motion import EventMotion
-from sharpfield.formation.threshold import FixedThresholds
-from sharpfield.formation.tone import Tone, tone_of
-from sharpfield.metrics.sharpness import luma
+from sharpfield.metrics.image import luma
 
 PAIRS = 4
 """Pairs of neighbouring frames looked at, spread over the capture."""

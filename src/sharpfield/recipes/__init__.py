@@ -8,15 +8,14 @@ from typing import Any
 
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.d_nerf import DNeRF
+from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
-from sharpfield.recipes.ev_dynamic_splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 from sharpfield.recipes.hybrid import Hybrid
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.room_splat import RoomSplat
-from sharpfield.recipes.splats import BlurSplat, EdiSplat, EventSplat, EvSplat, Splat
+from sharpfield.recipes.splat import BlurSplat, EdiSplat, EventSplat, EvSplat, RoomSplat, Splat
 
 RECIPES: dict[str, Any] = {
     "nerf": NeRF,

@@ -11,19 +11,18 @@ from typing import ClassVar
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.captures import draw_pixels, pixel_table
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
+from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
-from sharpfield.formation.tone import tone_of
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes.frame_term import Terms
-from sharpfield.recipes.volume import stages
-from sharpfield.recipes.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.recipes.volume.frame_terms import Terms
+from sharpfield.recipes.volume.scene import stages
+from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
 
 PAPER = Paper(
     key="pumarola2021dnerf",

@@ -17,15 +17,21 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
-from sharpfield.formation.tone import tone_of
-from sharpfield.recipes.event_term import EventOptions, EventTerm
-from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, MotionTerm, Terms
-from sharpfield.recipes.learned_blur import KernelOptions, LearnedBlur, trust
-from sharpfield.recipes.prior import InstantsPrior, MiddlePrior, PriorOptions
-from sharpfield.recipes.volume import Volume, VolumeOptions, stages
+from sharpfield.core.tone import tone_of
+from sharpfield.recipes.volume.event_term import EventOptions, EventTerm
+from sharpfield.recipes.volume.frame_terms import (
+    FrameOptions,
+    InstantsPrior,
+    KernelTerm,
+    MiddlePrior,
+    MotionTerm,
+    PriorOptions,
+    Terms,
+)
+from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, trust
+from sharpfield.recipes.volume.scene import Volume, VolumeOptions, stages
 
 PAPER = Paper(
     key="cannici2024evdeblurnerf",

@@ -12,27 +12,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.captures import event_index
-from sharpfield.captures.draw_binned import (
-    BinnedTable,
-    Halved,
-    binned_table,
-    draw_binned,
-    open_windows,
-)
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, EventPairs
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
+from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse, luma
-from sharpfield.losses.windows import dead_zone_error, scaled_error
-from sharpfield.recipes.event_term import thresholds_of
-from sharpfield.recipes.frame_term import Terms
-from sharpfield.recipes.volume import stages
-from sharpfield.recipes.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.losses.events import dead_zone_error, scaled_error
+from sharpfield.recipes.volume.frame_terms import Terms
+from sharpfield.recipes.volume.scene import stages
+from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.sampling.binned import BinnedTable, Halved, binned_table, draw_binned, open_windows
+from sharpfield.storage.event_cache import event_index
 
 FLOOR = 1e-10
 """Light added before the logarithm."""

@@ -15,25 +15,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.captures import draw_pixels, event_index, pair_table, pixel_table
-from sharpfield.captures.draw_windows import Lengths, draw_spans, draw_windows
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
+from sharpfield.core.tone import tone_of
+from sharpfield.events.threshold import FixedThresholds, LearnedThresholds, thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse, luma
 from sharpfield.formation.shutter import Shutter
-from sharpfield.formation.threshold import FixedThresholds, LearnedThresholds
-from sharpfield.formation.tone import tone_of
+from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
-from sharpfield.losses.windows import counted_error, exact_error
 from sharpfield.recipes import evdnerf
-from sharpfield.recipes.event_term import thresholds_of
-from sharpfield.recipes.frame_term import Terms
-from sharpfield.recipes.moving import MovingOptions, MovingScene
+from sharpfield.recipes.volume.frame_terms import Terms
+from sharpfield.recipes.volume.voxel_scene import MovingOptions, MovingScene
+from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table
+from sharpfield.sampling.windows import Lengths, draw_spans, draw_windows
+from sharpfield.storage.event_cache import event_index
 
 PAPER = replace(
     evdnerf.PAPER, key="sharpfield-evdnerf-physical", title="EvDNeRF made physical", departures=()

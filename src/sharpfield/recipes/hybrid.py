@@ -22,13 +22,12 @@ from sharpfield.formation.patch_kernel import (
     LearnedKernel,
     motion_kernels,
 )
-from sharpfield.recipes.hybrid_checkpoint import load_released
-from sharpfield.recipes.image_sources import SourceOptions
-from sharpfield.recipes.judged import Judge, frame_weights
-from sharpfield.recipes.picture_branch import PictureBranch
-from sharpfield.recipes.point_model import DrawOptions, PointModel
+from sharpfield.metrics.frame_weights import Judge, frame_weights
 from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.point_scene import PointScene
+from sharpfield.recipes.points.hybrid_checkpoint import load_released
+from sharpfield.recipes.points.images import PictureBranch, SourceOptions
+from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.scene import PointScene
 
 PAPER = Paper(
     key="dai2023hybrid",

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 from sharpfield.fields.space_time import SpaceTimeSize
 from sharpfield.recipes.d_nerf import DNeRF
-from sharpfield.recipes.ev_dynamic_splat import DynamicSplat
+from sharpfield.recipes.dynamic_splat import DynamicSplat
 from sharpfield.recipes.evdnerf import EvDNeRF
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
 

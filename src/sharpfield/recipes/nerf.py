@@ -14,12 +14,11 @@ from torch import Tensor, nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, Pixels
 from sharpfield.core.paper import Paper
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
-from sharpfield.formation.tone import tone_of
-from sharpfield.recipes.frame_term import FrameOptions, KernelTerm, Terms
-from sharpfield.recipes.volume import Volume, VolumeOptions
+from sharpfield.core.tone import tone_of
+from sharpfield.recipes.volume.frame_terms import FrameOptions, KernelTerm, Terms
+from sharpfield.recipes.volume.scene import Volume, VolumeOptions
 
 PAPER = Paper(
     key="mildenhall2020nerf",

@@ -9,11 +9,11 @@ from typing import ClassVar, TypeVar
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
-from sharpfield.fields.point_networks import PointSizes
-from sharpfield.recipes.point_growth import GrowthOptions
-from sharpfield.recipes.point_model import DrawOptions, PointModel
-from sharpfield.recipes.point_scene import MarchOptions, PointScene
-from sharpfield.recipes.point_start import CloudOptions
+from sharpfield.fields.points.networks import PointSizes
+from sharpfield.initialisation.point_cloud import CloudOptions
+from sharpfield.recipes.points.growth import GrowthOptions
+from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.scene import MarchOptions, PointScene
 
 R = TypeVar("R", bound="PointNeRF")
 

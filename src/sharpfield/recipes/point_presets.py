@@ -3,13 +3,13 @@
 from dataclasses import replace
 from typing import TypeVar
 
-from sharpfield.fields.point_networks import PointSizes
+from sharpfield.fields.points.networks import PointSizes
+from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.recipes.hybrid import Hybrid
-from sharpfield.recipes.point_growth import GrowthOptions
-from sharpfield.recipes.point_model import DrawOptions
 from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.point_scene import MarchOptions
-from sharpfield.recipes.point_start import CloudOptions
+from sharpfield.recipes.points.growth import GrowthOptions
+from sharpfield.recipes.points.model import DrawOptions
+from sharpfield.recipes.points.scene import MarchOptions
 
 P = TypeVar("P", bound=PointNeRF)
 

@@ -11,9 +11,6 @@ from typing import Any
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
-from sharpfield.recipes.event_term import EventOptions
-from sharpfield.recipes.frame_term import FrameOptions
-from sharpfield.recipes.learned_blur import KernelOptions
 from sharpfield.recipes.moving_presets import (
     D_NERF_SIZES,
     DYNAMIC_SIZES,
@@ -23,9 +20,11 @@ from sharpfield.recipes.moving_presets import (
 )
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.point_presets import HYBRID_SIZES, HYBRID_VARIANTS, POINT_SIZES
-from sharpfield.recipes.prior import PriorOptions
-from sharpfield.recipes.splats import Splat
-from sharpfield.recipes.volume import VolumeOptions
+from sharpfield.recipes.splat import Splat
+from sharpfield.recipes.volume.event_term import EventOptions
+from sharpfield.recipes.volume.frame_terms import FrameOptions, PriorOptions
+from sharpfield.recipes.volume.learned_blur import KernelOptions
+from sharpfield.recipes.volume.scene import VolumeOptions
 
 
 def blender_full(recipe: EvDeblurNeRF) -> EvDeblurNeRF:

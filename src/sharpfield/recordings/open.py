@@ -12,17 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.aedat2 import open_aedat2
-from sharpfield.recordings.aedat3 import open_aedat3
-from sharpfield.recordings.aedat4 import open_aedat4
-from sharpfield.recordings.dat import open_dat
-from sharpfield.recordings.evt import open_evt
-from sharpfield.recordings.hdf5 import open_hdf5
-from sharpfield.recordings.nmnist import open_nmnist
-from sharpfield.recordings.npz import open_npy, open_npz, open_npz_folder
+from sharpfield.recordings.aedat.aedat2 import open_aedat2
+from sharpfield.recordings.aedat.aedat3 import open_aedat3
+from sharpfield.recordings.aedat.aedat4 import open_aedat4
+from sharpfield.recordings.prophesee.dat import open_dat
+from sharpfield.recordings.prophesee.evt import open_evt
 from sharpfield.recordings.recording import Recording
-from sharpfield.recordings.rosbag import open_rosbag
-from sharpfield.recordings.text import open_text
+from sharpfield.recordings.ros.recording import open_rosbag
+from sharpfield.recordings.tables.hdf5 import open_hdf5
+from sharpfield.recordings.tables.npz import open_nmnist, open_npy, open_npz, open_npz_folder
+from sharpfield.recordings.tables.text import open_text
 from sharpfield.recordings.video import open_images, open_video
 from sharpfield.storage.images import list_images
 

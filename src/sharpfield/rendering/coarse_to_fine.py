@@ -11,8 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from sharpfield.core.protocols import Field
-from sharpfield.core.radiance import Radiance, Samples
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays, Samples
 from sharpfield.geometry.space import Space
 from sharpfield.ops import stepfun
 from sharpfield.rendering.gather import Compositing, Work, gather

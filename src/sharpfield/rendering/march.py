@@ -7,8 +7,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.geometry.space import Frustum, Space
 from sharpfield.ops import stepfun
 from sharpfield.ops.voxel_march import march

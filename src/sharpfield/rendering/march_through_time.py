@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
+from sharpfield.core.rays import Radiance, Rays
 from sharpfield.ops.space_time_march import march_through_time
 
 

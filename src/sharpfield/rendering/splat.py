@@ -14,12 +14,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.extras import need
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.views import Views
+from sharpfield.core.errors import need
+from sharpfield.core.rays import Radiance, Views
 from sharpfield.ops.rasterize import Canvas, rasterize
-from sharpfield.rendering.lens import flattened, resampled
-from sharpfield.rendering.rolling import row_shift
+from sharpfield.rendering.splat_lens import flattened, resampled
+from sharpfield.rendering.splat_rolling import row_shift
 
 
 @runtime_checkable

@@ -8,9 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.radiance import Radiance
-from sharpfield.core.rays import Rays
-from sharpfield.core.views import Views
+from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.geometry.cast import cast
 from sharpfield.rendering.splat import whole
 

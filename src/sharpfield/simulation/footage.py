@@ -16,11 +16,11 @@ from jaxtyping import Float32, Int64
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.core.exposure import Exposure
-from sharpfield.geometry import Still
-from sharpfield.simulation.blur import FrameSensor, decode
-from sharpfield.simulation.event_sensor import EventSensor
-from sharpfield.simulation.recorder import Recorder
+from sharpfield.core.frames import Exposure
+from sharpfield.geometry.trajectory import Still
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.sensors.frames import FrameSensor, decode
+from sharpfield.simulation.simulate import Recorder
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 """Endings of picture files."""

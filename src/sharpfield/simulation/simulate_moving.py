@@ -13,16 +13,15 @@ import numpy as np
 
 from sharpfield.core.capture import Capture, Clock, Note, Split
 from sharpfield.core.events import EventStream, merged
-from sharpfield.core.exposure import Exposure
-from sharpfield.core.frames import Frames
+from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.core.seed import number
-from sharpfield.geometry import Still, Tracks
-from sharpfield.simulation.cameras import RING_FOCAL, Standing, Views, ring
-from sharpfield.simulation.flow import depth_and_flow
-from sharpfield.simulation.motion import CameraPath, stamped
-from sharpfield.simulation.moving_scenes import moving_scene
-from sharpfield.simulation.scenes import Scene
+from sharpfield.geometry.trajectory import Still, Tracks
+from sharpfield.simulation.cameras.motion import CameraPath, stamped
+from sharpfield.simulation.cameras.rigs import RING_FOCAL, Standing, Views, ring
+from sharpfield.simulation.scenes.flow import depth_and_flow
+from sharpfield.simulation.scenes.moving import moving_scene
+from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.simulate import Rig, Timing, record
 
 MOVING_RIG = Rig(size=(128, 128), focal_of_width=RING_FOCAL)

@@ -16,22 +16,19 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt16
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Note, Split
-from sharpfield.core.depth import MILLIMETRE, DepthMaps
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
-from sharpfield.core.exposure import Exposure
-from sharpfield.core.frames import Frames
+from sharpfield.core.frames import MILLIMETRE, DepthMaps, Exposure, Frames
 from sharpfield.core.seed import numpy_generator
-from sharpfield.simulation.blur import Exposing, store
-from sharpfield.simulation.depth_sensor import DepthSensor, drifting
-from sharpfield.simulation.events import EventPixels, Gap, joined
-from sharpfield.simulation.motion import CameraPath, stamped
-from sharpfield.simulation.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
-from sharpfield.simulation.room import room
-from sharpfield.simulation.scenes import Scene
+from sharpfield.simulation.cameras.motion import CameraPath, exposure_for, instants, stamped, travel
+from sharpfield.simulation.cameras.walk import walk
+from sharpfield.simulation.scenes.room import room
+from sharpfield.simulation.scenes.static import Scene
+from sharpfield.simulation.sensors.depth import DepthSensor, drifting
+from sharpfield.simulation.sensors.events import EventPixels, Gap, joined
+from sharpfield.simulation.sensors.frames import Exposing, store
+from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.simulation.simulate import MARGIN_US, Rig, drawn_ahead, view
-from sharpfield.simulation.travel import exposure_for, instants, travel
-from sharpfield.simulation.walk import walk
 
 BLURRY_OF_WIDTH = 0.006
 """A frame counts as blurry when its points travel this share of the image's width: 1.4 px of 240,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from sharpfield.core.growth import Growth
+from sharpfield.core.points import Growth
 from sharpfield.core.protocols import PointSet
 
 

@@ -1,9 +1,16 @@
-"""A whole run: plan it, train, save, log, stop politely, and go on where it stopped."""
+"""A whole run: plan it, train, save, log, stop politely, and go on where it stopped.
+
+When to end training early, between two steps: a signal, or time that is up.
+"""
 
 import dataclasses
 import itertools
+import signal
+import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FrameType, TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -17,7 +24,56 @@ from sharpfield.training.log import Log, LogLosses
 from sharpfield.training.optim import adam, device_of
 from sharpfield.training.plan import Build, Options, Plan, make_plan
 from sharpfield.training.record import Ledger, Record, read_ledger, write_ledger
-from sharpfield.training.stop import Stop
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Stop:
+    """While open, turns the first interrupt into a request to end after the step under way.
+
+    A second interrupt ends the program at once, as it would without this.
+    """
+
+    def __init__(self, *, minutes: float | None = None) -> None:
+        """Allow `minutes` from now; None for as long as it takes."""
+        self.deadline = None if minutes is None else time.monotonic() + 60 * minutes
+        self.interrupted = ""
+        self.earlier: dict[int, Any] = {}
+
+    def __enter__(self) -> "Stop":
+        if threading.current_thread() is threading.main_thread():
+            self.earlier = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._give_back()
+
+    @property
+    def reason(self) -> str:
+        """Why training should end now; empty if it should not."""
+        if self.interrupted:
+            return self.interrupted
+        return "the time is up" if self.seconds_left <= 0 else ""
+
+    @property
+    def seconds_left(self) -> float:
+        """Until the time is up."""
+        return float("inf") if self.deadline is None else self.deadline - time.monotonic()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.interrupted = f"interrupted by {signal.Signals(number).name}"
+        self._give_back()
+
+    def _give_back(self) -> None:
+        for number, handler in self.earlier.items():
+            signal.signal(number, handler)
+        self.earlier = {}
+
 
 CHECKPOINT_SECONDS = 60.0
 """Between checkpoints, unless a number of steps is given."""

@@ -18,16 +18,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.extras import need
+from sharpfield.core.errors import need
 from sharpfield.ops.fast._kernel import memory, spread
-from sharpfield.ops.fast._splat_blend import LANES, TILE, blend, blend_back
-from sharpfield.ops.fast._splat_project import (
-    CHUNK,
-    GEOMETRY,
-    list_touches,
-    project,
-    project_back,
-)
+from sharpfield.ops.fast._splat_blend import GEOMETRY, LANES, TILE, blend, blend_back
+from sharpfield.ops.fast._splat_project import CHUNK, list_touches, project, project_back
 from sharpfield.ops.rasterize import NEAR, WIDEN, Canvas, Drawn, rasterize
 
 

@@ -1,0 +1,218 @@
+"""Posed photographs: pictures whose poses are known, but not how the camera moved meanwhile.
+
+Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds.
+Whether such photos are blurred by motion, their exposures cannot tell; `notes["motion"]` is
+"unknown" then, and recipes with a learned blur kernel take it from there.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64, Int64, Shaped
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry.trajectory import Still
+from sharpfield.storage.images import list_images
+
+SECOND_US = 1_000_000
+
+HOLD_OUT = "every:8"
+"""LLFF's rule of what to hold out, see `captures.hold_out`."""
+
+Missing = Literal["error", "skip"]
+"""What to do about images that are named but not there."""
+
+
+@dataclass(frozen=True)
+class Photos:
+    """Pictures of one camera with their poses."""
+
+    images: Shaped[np.ndarray, "n h w c"]
+    """As stored."""
+    poses: Float64[np.ndarray, "n 3 4"]
+    """World-from-camera, OpenCV axes."""
+    names: Sequence[str]
+    camera: Camera
+    """May be given for another size; it is fitted to the images."""
+    encoding: str = "srgb"
+    """How stored values relate to light, see `Frames`."""
+
+
+def photo_capture(
+    photos: Photos,
+    split: Split,
+    *,
+    bounds: tuple[float, float],
+    name: str,
+    source: str,
+    points: Float64[np.ndarray, "m 3"] | None = None,
+    notes: Mapping[str, float | str] | None = None,
+) -> Capture:
+    """A capture of photos that were taken one by one.
+
+    Args:
+        photos: The pictures.
+        split: Which are learned from.
+        bounds: Nearest and farthest depth of the scene.
+        name: Name of the scene.
+        source: The layout it was read from.
+        points: Sparse scene points.
+        notes: What else there is to say; by default that the motion is unknown.
+    """
+    count, height, width, _ = photos.images.shape
+    taken_us = np.arange(count, dtype=np.int64) * SECOND_US
+    frames = Frames(
+        images=photos.images,
+        exposure=Exposure(taken_us, taken_us),
+        track=np.arange(count, dtype=np.int64),
+        names=tuple(photos.names),
+        encoding=photos.encoding,
+    )
+    return Capture(
+        camera=fitted(photos.camera, width, height, where=name),
+        trajectory=Still(photos.poses),
+        clock=Clock(0, max(count - 1, 1) * SECOND_US),
+        near=bounds[0],
+        far=bounds[1],
+        frames=frames,
+        split=split,
+        points=points,
+        name=name,
+        source=source,
+        notes={"motion": "unknown", **(notes or {})},
+    )
+
+
+def choose_images(folder: Path, factor: int | None) -> Path:
+    """The folder of images to read: `images_<factor>`, or the smallest that are there.
+
+    `images` stands for a factor of 1 where there is no `images_1`.
+
+    Raises:
+        CaptureError: There is none, or not this one.
+    """
+    found = {
+        int(match[1] or 1): path
+        for path in sorted(folder.glob("images*/"))
+        if (match := re.fullmatch(r"images(?:_(\d+))?", path.name)) and list_images(path)
+    }
+    if not found or (factor is not None and factor not in found):
+        raise CaptureError(
+            "no images" if not found else f"there are no images of factor {factor}",
+            where=folder,
+            got=", ".join(path.name for path in found.values()) or "no images*/ with PNG or JPEG",
+            do="put them in images_<factor>/, or images/ for full size",
+        )
+    return found[max(found) if factor is None else factor]
+
+
+def existing(paths: Sequence[Path], *, missing: Missing, where: object) -> Int64[np.ndarray, "m"]:
+    """Indices of the files that are there.
+
+    Raises:
+        CaptureError: Some are not and `missing` is "error", or none is there.
+    """
+    there = np.array([path.is_file() for path in paths], bool)
+    gone = np.flatnonzero(~there)
+    if len(gone) and (missing == "error" or not there.any()):
+        named = ", ".join(paths[i].name for i in gone[:3])
+        raise CaptureError(
+            f"{len(gone)} of {len(paths)} images are missing",
+            where=where,
+            got=f"no {named}{', ...' if len(gone) > 3 else ''} in {paths[gone[0]].parent}",
+            do="complete the download, or read with missing='skip' to use those that are there",
+        )
+    return np.flatnonzero(there)
+
+
+def fitted(camera: Camera, width: int, height: int, *, where: object) -> Camera:
+    """The camera of images that were scaled to another size.
+
+    Raises:
+        CaptureError: The shape is another: the images were cropped, or are not this camera's.
+    """
+    sx, sy = width / camera.width, height / camera.height
+    # Each side may have been rounded to whole pixels, up or down.
+    if abs(sx - sy) > max(1 / camera.width, 1 / camera.height):
+        raise CaptureError(
+            "images and intrinsics have different shapes",
+            where=where,
+            got=f"images {width}x{height}, intrinsics for {camera.width}x{camera.height}",
+            do="give intrinsics for these images; cropping moves the principal point",
+        )
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx_px=camera.fx_px * sx,
+        fy_px=camera.fy_px * sy,
+        cx_px=camera.cx_px * sx,
+        cy_px=camera.cy_px * sy,
+    )
+
+
+def same_camera(cameras: Sequence[Camera], names: Sequence[str], *, where: object) -> Camera:
+    """The camera that all photos share.
+
+    Raises:
+        CaptureError: They do not share one.
+    """
+    for camera, name in zip(cameras, names, strict=True):
+        if not _agree(camera, cameras[0]):
+            raise CaptureError(
+                "all photos of a capture must share one camera",
+                where=f"{where}, {names[0]} and {name}",
+                got=f"{cameras[0]} and {camera}",
+                do="undistort the photos to one camera, or keep those of one camera",
+            )
+    return cameras[0]
+
+
+def depth_bounds(
+    points: Float64[np.ndarray, "m 3"],
+    poses: Float64[np.ndarray, "n 3 4"],
+    seen: Int64[np.ndarray, "o 2"],
+    *,
+    where: object,
+) -> tuple[float, float]:
+    """Near and far of a scene: the 0.1th and 99.9th percentile of depth, the extreme cameras'.
+
+    Args:
+        points: Sparse scene points.
+        poses: World-from-camera.
+        seen: Which camera (row of `poses`) saw which point (row of `points`).
+        where: The scene, for the message.
+
+    Raises:
+        CaptureError: No camera saw a point before it.
+
+    Source: LLFF's `imgs2poses`.
+    """
+    camera, point = seen[np.argsort(seen[:, 0], kind="stable")].T
+    depth = ((points[point] - poses[camera, :, 3]) * poses[camera, :, 2]).sum(-1)
+    camera, depth = camera[depth > 0], depth[depth > 0]
+    each = np.split(depth, np.flatnonzero(np.diff(camera)) + 1)
+    limits = [np.percentile(one, [0.1, 99.9]) for one in each if len(one)]
+    if not limits:
+        raise CaptureError(
+            "no scene point lies before a camera that saw it, so depth bounds are unknown",
+            where=where,
+            do="give near and far",
+        )
+    return float(np.min(limits)), float(np.max(limits))
+
+
+def _agree(a: Camera, b: Camera) -> bool:
+    if (a.size, a.lens) != (b.size, b.lens):
+        return False
+    focal_and_centre = [(c.fx_px, c.fy_px, c.cx_px, c.cy_px) for c in (a, b)]
+    return np.allclose(*focal_and_centre, rtol=1e-5) and np.allclose(
+        a.distortion, b.distortion, atol=1e-6
+    )

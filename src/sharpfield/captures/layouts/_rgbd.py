@@ -1,0 +1,230 @@
+"""Recordings of depth cameras: colour, depth and a pose for each frame, in files of many layouts.
+
+A layout's reader says where things are (`RgbdFrames`); what is common happens here. Frames without
+a usable pose are left out, and `notes["dropped"]` says so. As for all photos with one pose each
+(`captures.photos`), every frame is an instant on a still track of its own.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, Shaped, UInt8, UInt16
+
+from sharpfield.captures.layouts._photos import Photos, photo_capture
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import MILLIMETRE, DepthMaps
+from sharpfield.storage.mapped_images import mapped
+
+BOUNDS = (0.1, 8.0)
+"""Nearest and farthest depth of rooms, in metres."""
+SIZE = (640, 480)
+"""Larger images are brought to this size; upright ones to the same, turned."""
+SAME_SHAPE = 0.02
+"""Images of about the same shape are brought to that size exactly, as published; others keep
+their own shape."""
+OFF_CENTRE = 0.25
+"""Intrinsics whose principal point is farther from the middle, over the size, are not the image's.
+"""
+FARTHEST_POSE = 30.0
+"""Poses with a larger entry are failures of tracking, not places in a room."""
+NAMED = 6
+"""Dropped frames that are named."""
+
+Row = int
+"""Number of a frame in its recording."""
+
+
+@dataclass(frozen=True)
+class RgbdFrames:
+    """Where the frames of a recording are, before any is decoded."""
+
+    names: Sequence[str]
+    poses: Float64[np.ndarray, "n 3 4"]
+    """World-from-camera, OpenCV axes; not finite where tracking failed."""
+    colour: Callable[[Row], UInt8[np.ndarray, "h w 3"]]
+    """Decodes the image of a frame."""
+    depth: Callable[[Row], UInt16[np.ndarray, "y x"]] | None
+    """Decodes the depth of a frame, in mm, 0 where unknown."""
+    measured: Bool[np.ndarray, "n"]
+    """Which frames have depth; where there is none, it is unknown everywhere."""
+    camera: Camera
+    """Of the colour images as stored."""
+    depth_camera: Camera
+    sources: Sequence[Path]
+    """The files that colour comes from."""
+    depth_sources: Sequence[Path]
+    """The files that depth comes from."""
+
+
+def rgbd_capture(
+    frames: RgbdFrames,
+    split: Callable[[int], Split],
+    *,
+    folder: Path,
+    source: str,
+    bounds: tuple[float, float] = BOUNDS,
+    encoding: str = "srgb",
+    points: Float64[np.ndarray, "m 3"] | None = None,
+) -> Capture:
+    """A capture of a depth camera's recording.
+
+    Args:
+        frames: Where its frames are.
+        split: What to hold out of so many frames; poses that failed do not count.
+        folder: Of the recording; names it.
+        source: The layout.
+        bounds: Nearest and farthest depth.
+        encoding: How stored values relate to light.
+        points: Scene points that came with it.
+
+    Raises:
+        CaptureError: No frame has a pose, or an image cannot be read.
+    """
+    usable = usable_poses(frames.poses)
+    kept = np.flatnonzero(usable)
+    if not len(kept):
+        raise CaptureError("no frame has a usable pose", where=folder, got=f"{len(usable)} frames")
+    camera = resized(frames.camera, SIZE)
+    images = mapped(
+        kept.tolist(),
+        lambda row: _sized(frames.colour(row), camera.size),
+        sources=frames.sources,
+        kind=f"colour {camera.width}x{camera.height}",
+    )
+    depth = None
+    if frames.depth is not None and frames.measured[kept].any():
+        maps = _depth_maps(frames, frames.depth, kept.tolist())
+        depth = DepthMaps(maps, frames.depth_camera, MILLIMETRE)
+    photos = Photos(
+        images=images,
+        poses=frames.poses[kept],
+        names=[frames.names[i] for i in kept.tolist()],
+        camera=camera,
+        encoding=encoding,
+    )
+    made = photo_capture(
+        photos,
+        split(len(kept)),
+        bounds=bounds,
+        name=folder.resolve().name,
+        source=source,
+        points=points,
+        notes=_notes(frames, usable),
+    )
+    return replace(made, depth=depth)
+
+
+def usable_poses(poses: Float64[np.ndarray, "n 3 4"]) -> Bool[np.ndarray, "n"]:
+    """Which poses are finite and within a room."""
+    largest = np.abs(poses).reshape(len(poses), -1).max(1)
+    return np.isfinite(largest) & (largest < FARTHEST_POSE)
+
+
+def resized(camera: Camera, most: tuple[int, int]) -> Camera:
+    """A camera whose images are brought to a size if they are larger, see `SAME_SHAPE`."""
+    wide, high = most if camera.width >= camera.height else most[::-1]
+    if camera.width <= wide and camera.height <= high:
+        return camera
+    sx, sy = wide / camera.width, high / camera.height
+    if abs(sx / sy - 1) > SAME_SHAPE:
+        wide, high = (max(round(side * min(sx, sy)), 1) for side in camera.size)
+        sx, sy = wide / camera.width, high / camera.height
+    return replace(
+        camera,
+        width=wide,
+        height=high,
+        fx_px=camera.fx_px * sx,
+        fy_px=camera.fy_px * sy,
+        cx_px=camera.cx_px * sx,
+        cy_px=camera.cy_px * sy,
+    )
+
+
+def pinhole(matrix: Shaped[np.ndarray, "r c"], size: tuple[int, int], *, where: object) -> Camera:
+    """A camera of an intrinsic matrix, 3x3 or larger, for pixel centres at +0.5.
+
+    Raises:
+        CaptureError: It is no such matrix, or one for images of another size.
+    """
+    if matrix.ndim != 2 or min(matrix.shape) < 3 or not np.isfinite(matrix[:3, :3]).all():
+        raise CaptureError("cannot read the intrinsics", where=where, got=f"{matrix.shape} numbers")
+    fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    off = max(abs(cx / size[0] - 0.5), abs(cy / size[1] - 0.5))
+    if off > OFF_CENTRE or not min(fx, fy) > 0:
+        raise CaptureError(
+            "the intrinsics are not those of the images",
+            where=where,
+            got=f"focal lengths {fx:.4g}, {fy:.4g}, principal point {cx:.4g}, {cy:.4g} px;"
+            f" images of {size[0]}x{size[1]}",
+            do="give intrinsics for images of this size, or the images that they are for",
+        )
+    return Camera(*size, fx, fy, cx, cy)
+
+
+def read_matrix(path: Path) -> Shaped[np.ndarray, "r c"]:
+    """The numbers of a text, a row each line; `inf` and `nan` are numbers, too.
+
+    Raises:
+        CaptureError: It is missing, or no table of numbers.
+    """
+    try:
+        return np.loadtxt(path, ndmin=2)
+    except FileNotFoundError:
+        raise CaptureError("file not found", where=path) from None
+    except (ValueError, UnicodeDecodeError) as error:
+        raise CaptureError("cannot read the numbers of a text", where=path, got=error) from None
+
+
+def read_pose(path: Path) -> Float64[np.ndarray, "3 4"]:
+    """World-from-camera, from a text with a 3x4 or 4x4 matrix.
+
+    Raises:
+        CaptureError: It is missing, or has another shape.
+    """
+    matrix = read_matrix(path)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise CaptureError(
+            "a pose must have 4 columns and 3 or 4 rows", where=path, got=matrix.shape
+        )
+    return matrix[:3].astype(np.float64)
+
+
+def _sized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x 3"]:
+    if image.shape[1::-1] == size:
+        return image
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _depth_maps(
+    frames: RgbdFrames, decode: Callable[[Row], UInt16[np.ndarray, "y x"]], rows: list[Row]
+) -> UInt16[np.ndarray, "m y x"]:
+    unknown = np.zeros(frames.depth_camera.size[::-1], np.uint16)
+    return mapped(
+        rows,
+        lambda row: decode(row) if frames.measured[row] else unknown,
+        sources=frames.depth_sources,
+        kind="depth",
+    )
+
+
+def _notes(frames: RgbdFrames, usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:
+    """Which frames were left out, and which have no depth."""
+    notes: dict[str, float | str] = {}
+    if not usable.all():
+        notes["dropped"] = _named(frames, ~usable, "have no usable pose")
+    if frames.depth is not None and not frames.measured[usable].all():
+        notes["without_depth"] = _named(frames, usable & ~frames.measured, "have no depth")
+    return notes
+
+
+def _named(frames: RgbdFrames, which: Bool[np.ndarray, "n"], what: str) -> str:
+    rows = np.flatnonzero(which).tolist()
+    named = ", ".join(frames.names[i] for i in rows[:NAMED]) + (
+        ", ..." if len(rows) > NAMED else ""
+    )
+    return f"{len(rows)} of {len(which)} frames {what}: {named}"

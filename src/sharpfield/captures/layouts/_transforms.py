@@ -1,0 +1,212 @@
+"""What the dialects of `transforms.json` share: OpenGL camera-to-world matrices and image paths.
+
+The columns of `transform_matrix` are the camera's right, up and backward axes and its centre in
+the world; here the axes become OpenCV's right, down, forward.
+
+Pictures of a scene that moves, taken from known poses at known times: `transforms_<set>.json`.
+
+Each frame has a `time` of 0...1 beside its pose, and the set has a `camera_angle_x`. The
+recording is said to last one second, since these files know no other unit.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64, Shaped
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Clock
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry.trajectory import check_poses
+from sharpfield.storage.images import SUFFIXES, Alpha, read_images
+
+OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        CaptureError: The file is missing or is not one.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CaptureError("file not found", where=path) from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CaptureError("not a JSON file", where=path, got=error) from None
+    if not isinstance(content, dict):
+        raise CaptureError("must be a JSON object", where=path, got=type(content).__name__)
+    return content
+
+
+def frames_of(content: dict[str, Any], where: object) -> list[dict[str, Any]]:
+    """The list of frames, each with `file_path` and `transform_matrix`.
+
+    Raises:
+        CaptureError: There is none, or a frame lacks one of these.
+    """
+    frames = content.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise CaptureError("there are no frames", where=f"{where}, key `frames`")
+    for i, frame in enumerate(frames):
+        for key, kind in (("file_path", str), ("transform_matrix", list)):
+            if not isinstance(frame, dict) or not isinstance(frame.get(key), kind):
+                raise CaptureError(f"a frame lacks `{key}`", where=f"{where}, frame {i}")
+    return frames
+
+
+def poses_of(frames: Sequence[dict[str, Any]], where: object) -> Float64[np.ndarray, "n 3 4"]:
+    """World-from-camera poses in OpenCV axes.
+
+    Raises:
+        CaptureError: A matrix is not 3x4 or 4x4, or holds no rotation.
+    """
+    try:
+        matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)
+    except (ValueError, TypeError):
+        matrices = np.zeros(0)
+    if matrices.shape[1:] not in ((4, 4), (3, 4)):
+        raise CaptureError("each `transform_matrix` must be 4x4 or 3x4 numbers", where=where)
+    poses = matrices[:, :3] * OPENCV_FROM_OPENGL
+    check_poses(poses, where)
+    return poses
+
+
+def image_path(folder: Path, file_path: str) -> Path:
+    """Where a frame's image is; the suffix may be left out in the file."""
+    path = folder / file_path
+    if path.suffix.lower() in SUFFIXES:
+        return path
+    named = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in named if candidate.is_file()), named[0])
+
+
+def frame_name(file_path: str) -> str:
+    """A frame's name: its path without suffix, e.g. `train/r_0`."""
+    path = Path(file_path)
+    if path.suffix.lower() in SUFFIXES:
+        path = path.with_suffix("")
+    return path.as_posix()
+
+
+def number(content: dict[str, Any], key: str, where: object) -> float:
+    """A required number.
+
+    Raises:
+        CaptureError: It is missing or no number.
+    """
+    value = content.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise CaptureError(f"`{key}` must be a number", where=where, got=value)
+    return float(value)
+
+
+SECOND_US = 1_000_000
+ONE_SECOND = Clock(0, SECOND_US)
+
+
+@dataclass(frozen=True)
+class TimedViews:
+    """The frames of one set."""
+
+    names: tuple[str, ...]
+    paths: tuple[Path, ...]
+    """Where images are, whether or not they are there."""
+    time: Float64[np.ndarray, "n"]
+    """0...1."""
+    poses: Float64[np.ndarray, "n 3 4"]
+    """World-from-camera, OpenCV axes."""
+    angle_rad: float
+    """Of view, from the left edge to the right."""
+    focal_px: float
+    """Stated instead; 0 if it is not."""
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.names)
+
+    @property
+    def t_us(self) -> Int64[np.ndarray, "n"]:
+        """Times in us, the whole lasting one second."""
+        return np.rint(self.time * SECOND_US).astype(np.int64)
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The camera of images of a size."""
+        focal = self.focal_px or 0.5 * width / math.tan(0.5 * self.angle_rad)
+        return Camera(width, height, focal, focal, width / 2, height / 2)
+
+
+def read_views(path: Path) -> TimedViews:
+    """The frames of one `transforms_<set>.json`.
+
+    Raises:
+        CaptureError: It is missing or malformed, or a time is not in 0...1.
+    """
+    content = read_json(path)
+    frames = frames_of(content, path)
+    angle = number(content, "camera_angle_x", path)
+    if not 0 < angle < math.pi:
+        raise CaptureError("`camera_angle_x` must lie between 0 and pi rad", where=path, got=angle)
+    time = np.array([_time(frame, f"{path}, frame {i}") for i, frame in enumerate(frames)])
+    files = [frame["file_path"] for frame in frames]
+    return TimedViews(
+        names=tuple(frame_name(file) for file in files),
+        paths=tuple(image_path(path.parent, file) for file in files),
+        time=time,
+        poses=poses_of(frames, path),
+        angle_rad=angle,
+        focal_px=number({"focal": 0.0, **content}, "focal", path),
+    )
+
+
+def has_times(path: Path) -> bool:
+    """Whether the first frame of a `transforms_<set>.json` says when it was taken."""
+    try:
+        frames = read_json(path).get("frames")
+    except CaptureError:
+        return False
+    return isinstance(frames, list) and bool(frames) and "time" in frames[0]
+
+
+def images_of(
+    sets: Sequence[TimedViews], *, alpha: Alpha = "drop"
+) -> Shaped[np.ndarray, "n h w c"] | None:
+    """The images of all sets, or None if none of them is there.
+
+    Raises:
+        CaptureError: Some are there and some are not, or they differ in size or type.
+    """
+    paths = [path for one in sets for path in one.paths]
+    if not any(path.is_file() for path in paths):
+        return None
+    return read_images(paths, alpha=alpha)
+
+
+def expect_one_camera(sets: Sequence[TimedViews], where: Path) -> None:
+    """Make sure that all sets were taken with one camera.
+
+    Raises:
+        CaptureError: They were not.
+    """
+    seen = {(round(one.angle_rad, 6), round(one.focal_px, 3)) for one in sets}
+    if len(seen) > 1:
+        raise CaptureError(
+            "the sets of a scene must share one camera",
+            where=where,
+            got=", ".join(
+                f"camera_angle_x {angle}, focal {focal}" for angle, focal in sorted(seen)
+            ),
+        )
+
+
+def _time(frame: dict[str, Any], where: str) -> float:
+    time = number(frame, "time", where)
+    if not 0 <= time <= 1 + 1e-5:
+        raise CaptureError("`time` must lie between 0 and 1", where=where, got=time)
+    return min(time, 1.0)

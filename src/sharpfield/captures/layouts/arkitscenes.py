@@ -1,0 +1,149 @@
+"""ARKitScenes: recordings of an iPad with a lidar.
+
+    lowres_wide/VIDEO_TIME.png                  RGB, 256x192; TIME in seconds
+    lowres_depth/VIDEO_TIME.png                 16 bit, millimetres, registered
+    lowres_wide_intrinsics/VIDEO_TIME.pincam    `width height fx fy cx cy` of each frame
+    lowres_wide.traj                            `time rx ry rz tx ty tz` in s, rad, m
+
+Names of the three may differ by a millisecond, and depth may have been taken less often: an image
+keeps the depth of the same time, or has none. A line of the trajectory is camera from world: a turn
+about an axis, then a shift. It has ten poses a second and images sixty, so poses in between are
+interpolated, and images before the first or after the last are left out. The lens refocuses; a
+capture has one camera, so the median of all intrinsics stands for it, and `notes["focal_spread"]`
+says how far they stray.
+
+Source: Baruch et al., *ARKitScenes* (NeurIPS 2021 datasets track), its data description.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Shaped
+
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts._rgbd import RgbdFrames, read_matrix, rgbd_capture
+from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT, rgb
+from sharpfield.captures.native.frames import decode_depth
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry import se3
+from sharpfield.geometry.trajectory import Stamped
+
+WIDE, DEPTH, INTRINSICS = "lowres_wide", "lowres_depth", "lowres_wide_intrinsics"
+TRAJECTORY = "lowres_wide.traj"
+COLUMNS = 7
+SAME_S = 0.005
+"""Depth taken so shortly before or after an image is of the same time."""
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder holds such a recording."""
+    return (folder / WIDE).is_dir() and (folder / TRAJECTORY).is_file()
+
+
+def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb") -> Capture:
+    """Read a recording.
+
+    Args:
+        folder: Holds what the module describes.
+        hold_out: Which frames to hold out.
+        encoding: How stored values relate to light.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    colour = sorted((folder / WIDE).glob("*.png"), key=_seconds)
+    if not colour:
+        raise CaptureError(f"there are no images in {WIDE}/", where=folder)
+    camera, spread = _camera(folder)
+    maps, measured = _depth_of(colour, list((folder / DEPTH).glob("*.png")))
+    if not measured.any():
+        raise CaptureError(f"no image of {WIDE}/ has depth in {DEPTH}/", where=folder)
+    frames = RgbdFrames(
+        names=[path.stem for path in colour],
+        poses=_poses(folder / TRAJECTORY, [_seconds(path) for path in colour]),
+        colour=lambda row: rgb(colour[row]),
+        depth=lambda row: decode_depth(maps[row]),
+        measured=measured,
+        camera=camera,
+        depth_camera=camera,
+        sources=colour,
+        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
+    )
+    made = rgbd_capture(
+        frames,
+        lambda count: split_by_rule(count, hold_out),
+        folder=folder,
+        source="arkitscenes",
+        encoding=encoding,
+    )
+    return replace(made, notes=made.notes | {"focal_spread": spread})
+
+
+def _seconds(path: Path) -> float:
+    digits = path.stem.rpartition("_")[2]
+    try:
+        return float(digits)
+    except ValueError:
+        raise CaptureError(
+            "the name of an image must end in its time", where=path, do="name it VIDEO_TIME.png"
+        ) from None
+
+
+def _depth_of(
+    colour: Sequence[Path], depth: Sequence[Path]
+) -> tuple[list[Path], Bool[np.ndarray, "n"]]:
+    """The depth map next in time to each image, and whether it is of the same time."""
+    if not depth:
+        return list(colour), np.zeros(len(colour), bool)
+    ordered = sorted(depth, key=_seconds)
+    times, asked = (np.array([_seconds(path) for path in paths]) for paths in (ordered, colour))
+    after = np.searchsorted(times, asked).clip(1, max(len(times) - 1, 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(times[after] - asked < asked - times[before], after, before)
+    return [ordered[i] for i in nearest], np.abs(times[nearest] - asked) < SAME_S
+
+
+def _camera(folder: Path) -> tuple[Camera, float]:
+    """The camera of all frames, and how far the focal length strays, as a share."""
+    rows = [_pincam(path) for path in sorted((folder / INTRINSICS).glob("*.pincam"))]
+    table = np.stack(rows or [np.zeros(6)])
+    if not table[:, 2].all():
+        raise CaptureError("no image has intrinsics", where=folder / INTRINSICS)
+    width, height, fx, fy, cx, cy = np.median(table, axis=0).tolist()
+    return Camera(int(width), int(height), fx, fy, cx, cy), float(np.ptp(table[:, 2]) / fx)
+
+
+def _pincam(path: Path) -> Shaped[np.ndarray, "6"]:
+    row = read_matrix(path).ravel()
+    if len(row) != 6:
+        raise CaptureError("intrinsics must be six numbers", where=path, got=len(row))
+    return row
+
+
+def _poses(path: Path, times_s: Sequence[float]) -> Float64[np.ndarray, "n 3 4"]:
+    """Poses at the times of images; not a number outside of the trajectory."""
+    rows = read_matrix(path)
+    if rows.shape[1] != COLUMNS or len(rows) < 2:
+        raise CaptureError(
+            "a trajectory must have two lines or more of seven numbers", where=path, got=rows.shape
+        )
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    turn = se3.rotation_exp(torch.from_numpy(rows[:, 1:4])).numpy()
+    shift = rows[:, 4:, None]
+    poses = np.concatenate([turn.transpose(0, 2, 1), -turn.transpose(0, 2, 1) @ shift], -1)
+    known_us = np.rint(1e6 * (rows[:, 0] - rows[0, 0])).astype(np.int64)
+    fresh = np.flatnonzero(np.diff(known_us, prepend=-1) > 0)
+    clock = Clock(0, max(int(known_us[-1]), 1))
+    way = Stamped(known_us[fresh], np.ascontiguousarray(poses[fresh]), clock, "linear")
+    asked = np.rint(1e6 * (np.asarray(times_s) - rows[0, 0])).astype(np.int64)
+    inside = (asked >= 0) & (asked <= known_us[-1])
+    found = np.full((len(asked), 3, 4), np.nan)
+    unit = torch.from_numpy(clock.unit(asked[inside]))
+    found[inside] = way.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).double().numpy()
+    return found

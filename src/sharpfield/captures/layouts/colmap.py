@@ -1,0 +1,95 @@
+"""Photos with a COLMAP reconstruction.
+
+    images/ or images_N/    photos; images_N are N times smaller
+    sparse/0/               cameras, images and points3D, .bin or .txt;
+                            sparse/ and colmap/sparse/0/ are found, too
+
+Intrinsics are scaled to the size of the images that are read. Depth bounds come from the points.
+"""
+
+from pathlib import Path
+
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts._photos import (
+    HOLD_OUT,
+    Missing,
+    Photos,
+    choose_images,
+    depth_bounds,
+    existing,
+    photo_capture,
+    same_camera,
+)
+from sharpfield.captures.layouts.colmap_model import Model, find_model, read_model
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import SUFFIXES, read_images
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder holds a COLMAP model and images, and no other layout's table of poses."""
+    return (
+        find_model(folder) is not None
+        and any(folder.glob("images*/"))
+        and not (folder / "poses_bounds.npy").exists()
+        and not (folder / "transforms.json").exists()
+    )
+
+
+def read(
+    folder: Path,
+    *,
+    factor: int | None = None,
+    hold_out: str = HOLD_OUT,
+    bounds: tuple[float, float] | None = None,
+    missing: Missing = "error",
+    encoding: str = "srgb",
+) -> Capture:
+    """Read photos and their reconstruction.
+
+    Args:
+        folder: Holds what the module describes.
+        factor: Read `images_<factor>`; by default the smallest images there are.
+        hold_out: Which photos to hold out, e.g. `every:8`, `last:5` or `none`.
+        bounds: Nearest and farthest depth; by default what the points show.
+        missing: What to do about photos of the model that are not there.
+        encoding: How stored values relate to light.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    place = find_model(folder)
+    if place is None:
+        raise CaptureError("no COLMAP model", where=folder, do="put one in sparse/0")
+    model = read_model(place)
+    paths = _image_paths(choose_images(folder, factor), model)
+    kept = existing(paths, missing=missing, where=place)
+    names = [model.names[i] for i in kept]
+    photos = Photos(
+        images=read_images([paths[i] for i in kept]),
+        poses=model.poses[kept],
+        names=[Path(name).with_suffix("").as_posix() for name in names],
+        camera=same_camera([model.cameras[i] for i in kept], names, where=place),
+        encoding=encoding,
+    )
+    return photo_capture(
+        photos,
+        split_by_rule(len(kept), hold_out),
+        bounds=bounds or depth_bounds(model.points, model.poses, model.seen, where=place),
+        name=folder.resolve().name,
+        source="colmap",
+        points=model.points if len(model.points) else None,
+    )
+
+
+def _image_paths(folder: Path, model: Model) -> list[Path]:
+    """Where each photo is; smaller copies may have another suffix than the name says."""
+    return [_with_any_suffix(folder / name) for name in model.names]
+
+
+def _with_any_suffix(path: Path) -> Path:
+    candidates = [
+        path,
+        *(path.with_suffix(s) for suffix in SUFFIXES for s in (suffix, suffix.upper())),
+    ]
+    return next((candidate for candidate in candidates if candidate.is_file()), path)

@@ -1,0 +1,159 @@
+"""EventNeRF's data: one colour event camera that goes around a scene once.
+
+    train/pose/*.txt          camera-to-world, 16 numbers, OpenCV axes; pose i of n at i / (n - 1)
+    train/intrinsics/*.txt    16 numbers (a 4x4 matrix), or 20: a fifth row begins with k1, k2
+    train/events/NAME.npz     x, y, t, p; t in a unit that the files do not say
+    train/rgb/*.png           a picture for each pose, if there are any
+    test/, validation/        pose, intrinsics and rgb of other views, if there are any
+
+Time runs from 0 to the last event's. Its unit must be given: the authors only use t over its
+maximum. Poses are joined by straight lines. The sensor has an RGGB filter.
+
+Source: Rudnev et al., *EventNeRF* (CVPR 2023), and its data loader; NeRF++ for the layout.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int64, Shaped
+
+from sharpfield.captures.layouts.nerfstudio import guessed_bounds
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry.trajectory import Stamped, Tracks, check_poses
+from sharpfield.storage.event_cache import read_events
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.images import list_images, read_images
+
+SENSOR = (346, 260)
+"""Width and height in px of the authors' sensor, real and simulated."""
+TILE = "RGGB"
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder looks like such data."""
+    train = folder / "train"
+    return (train / "pose").is_dir() and any((train / "events").glob("*.npz"))
+
+
+def read(folder: Path, *, event_unit: str | None = None) -> Capture:
+    """Read the events, the poses, and the pictures if there are any.
+
+    Args:
+        folder: Holds what the module describes.
+        event_unit: Of the event times: ns, us, ms or s. Required.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together, or the unit is
+            not given.
+    """
+    train = folder / "train"
+    files = sorted((train / "events").glob("*.npz"))
+    if len(files) != 1:
+        raise CaptureError("there must be one file of events", where=train / "events", got=files)
+    poses, camera = _poses(train), _camera(train)
+    with open_events(files[0], unit=event_unit, size=SENSOR) as file:
+        if file.unit is None:
+            raise CaptureError(
+                "EventNeRF's files do not say the unit of their event times",
+                where=files[0],
+                do="give it with --event-unit (`event_unit`): ns, us, ms or s",
+            )
+        events = read_events(replace(file, bayer=TILE))
+    if not len(events) or len(poses) < 2:
+        raise CaptureError(
+            "there must be events, and at least two poses",
+            where=train,
+            got=f"{len(events)} events, {len(poses)} poses",
+        )
+    clock = Clock(0, int(events.t_us[-1]))
+    times_us = np.rint(np.linspace(0, clock.span_us, len(poses))).astype(np.int64)
+    path = Stamped(times_us, poses, clock, "linear")
+    others = [folder / name for name in ("test", "validation")]
+    held_out = next((other for other in others if _pictures(other)), None)
+    still = np.zeros((0, 3, 4)) if held_out is None else _poses(held_out)
+    frames, split = _frames(train, held_out, times_us, len(still))
+    near, far = guessed_bounds(poses)
+    return Capture(
+        camera=camera,
+        trajectory=Tracks([path], still) if len(still) else path,
+        clock=clock,
+        near=near,
+        far=far,
+        frames=frames,
+        events=events,
+        split=split,
+        name=folder.resolve().name,
+        source="event-nerf",
+        notes={"bounds": "guessed from where the cameras look"},
+    )
+
+
+def _pictures(folder: Path) -> list[Path]:
+    """The pictures of a set, if there are any."""
+    return list_images(folder / "rgb") if (folder / "rgb").is_dir() else []
+
+
+def _frames(
+    train: Path, held_out: Path | None, times_us: Int64[np.ndarray, "p"], others: int
+) -> tuple[Frames | None, Split]:
+    """Pictures on the moving track, and held-out ones on tracks of their own."""
+    moving, still = _pictures(train), [] if held_out is None else _pictures(held_out)
+    for name, found, poses in (("train", moving, len(times_us)), ("held-out", still, others)):
+        if found and len(found) != poses:
+            raise CaptureError(
+                f"there must be a pose for each {name} picture",
+                where=found[0].parent,
+                got=f"{len(found)} pictures, {poses} poses",
+            )
+    if not moving and not still:
+        return None, Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
+    t_us = np.concatenate([times_us[: len(moving)], np.zeros(len(still), np.int64)])
+    frames = Frames(
+        images=read_images([*moving, *still]),
+        exposure=Exposure(t_us, t_us),
+        track=np.concatenate([np.zeros(len(moving), np.int64), 1 + np.arange(len(still))]),
+        names=tuple(f"{path.parent.parent.name}/{path.stem}" for path in [*moving, *still]),
+        encoding="srgb",
+    )
+    every = np.arange(len(frames))
+    return frames, Split(every[: len(moving)], every[len(moving) :])
+
+
+def _camera(train: Path) -> Camera:
+    """The camera, which all poses share."""
+    files = sorted((train / "intrinsics").glob("*.txt"))
+    if not files:
+        raise CaptureError("there are no intrinsics", where=train / "intrinsics")
+    numbers = _numbers(files[0], (16, 20))
+    matrix, bent = numbers[:16].reshape(4, 4), numbers[16:18]
+    lens, distortion = "pinhole", ()
+    if bent.any():
+        lens, distortion = "brown", (float(bent[0]), float(bent[1]), 0.0, 0.0, 0.0)
+    fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Camera(*SENSOR, fx, fy, cx, cy, lens, distortion)
+
+
+def _poses(folder: Path) -> Float64[np.ndarray, "p 3 4"]:
+    files = sorted((folder / "pose").glob("*.txt"))
+    if not files:
+        raise CaptureError("there are no poses", where=folder / "pose")
+    poses = np.stack([_numbers(file, (16,)).reshape(4, 4)[:3] for file in files])
+    check_poses(poses, folder / "pose")
+    return poses
+
+
+def _numbers(path: Path, counts: tuple[int, ...]) -> Shaped[np.ndarray, "n"]:
+    """The numbers of a text file, as many as there may be."""
+    try:
+        numbers = np.array([float(word) for word in path.read_text().split()])
+    except (ValueError, UnicodeDecodeError) as error:
+        raise CaptureError("not a file of numbers", where=path, got=error) from None
+    if len(numbers) not in counts:
+        raise CaptureError(
+            f"there must be {' or '.join(map(str, counts))} numbers", where=path, got=len(numbers)
+        )
+    return numbers

@@ -1,0 +1,278 @@
+"""The layout of Ev-DeblurNeRF's data: blurry and sharp images, events, a stamped trajectory.
+
+    images_1/NN.png             8-bit RGB, sorted by name
+    images_1/timestamps.npz     timestamps_start, timestamps_end: us, one per image; equal if sharp
+    poses_bounds.npy            one row per image, see `captures.poses_bounds`
+    all_poses_bounds.npy        the trajectory, one row per stamp
+    all_timestamps.npy          its stamps, us
+    events.h5                   x, y, t, p
+    ev_map.npz                  inv_mapx, inv_mapy: Color-DAVIS only
+    truth.npz                   optional: sharp mid-exposure images, by name of the blurry one
+
+There are two variants. In Ev-DeblurBlender events have whole coordinates and times in ns. In
+Ev-DeblurCDAVIS a colour event camera's coordinates were rectified: the pixel in row j and column i
+of the raw sensor (RGGB) reports at (inv_mapx[j, i], inv_mapy[j, i]), exactly.
+
+Source: Cannici and Scaramuzza, *Mitigating Motion Blur in Neural Radiance Fields with Events and
+Frames* (CVPR 2024), its supplement and released data.
+"""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64, Shaped
+
+from sharpfield.captures.clocks import expect_overlap
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts._photos import choose_images
+from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import HELD_BACK_US, Capture, Clock
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream, SiteColour
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.core.protocols import Trajectory
+from sharpfield.geometry import se3
+from sharpfield.geometry.normalise import REFERENCE
+from sharpfield.geometry.trajectory import Stamped, Tracks
+from sharpfield.storage.arrays import load_array, load_arrays
+from sharpfield.storage.event_cache import read_events
+from sharpfield.storage.event_columns import whole_us
+from sharpfield.storage.event_layouts import THRESHOLDS, open_events
+from sharpfield.storage.images import list_images, read_images
+
+LAYOUT = "ev-deblur-nerf"
+
+TRAJECTORY = ("all_poses_bounds.npy", "all_timestamps.npy")
+
+OFF_TRAJECTORY_PX = 1.0
+"""A frame whose own pose would move the nearest things by more than this in the image, against
+the trajectory at its time, was not taken on the trajectory."""
+
+RGGB = np.array([[0, 1], [1, 2]], np.int8)
+"""Channels of the colour filter tile of a Color-DAVIS346."""
+
+Notes = dict[str, Shaped[np.ndarray, "..."] | float | str]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What the files of one of the two data sets leave unsaid."""
+
+    event_unit: str
+    encoding: str
+    hold_out: str
+    threshold: float
+    """Contrast threshold for both signs that the authors use."""
+    reference_poses: str
+    """The poses that their normalisation is taken over."""
+
+
+BLENDER = Variant("ns", "gamma2.2", "every:8", 0.2, "frames")
+COLOR_DAVIS = Variant("us", "linear", "last:5", 0.25, "trajectory")
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder has this layout: a trajectory's files, or a pose table and events."""
+    named = [(folder / name).is_file() for name in ("poses_bounds.npy", "events.h5")]
+    return all(named) or any((folder / name).is_file() for name in TRAJECTORY)
+
+
+def variant_of(folder: Path) -> Variant:
+    """Color-DAVIS if there is a map of rectified positions, else Blender."""
+    return COLOR_DAVIS if (folder / "ev_map.npz").is_file() else BLENDER
+
+
+def read(folder: Path, *, event_unit: str | None = None) -> Capture:
+    """Read a scene.
+
+    Frames taken on the trajectory are on track 0. A sharp frame taken before or after it, and any
+    whose own pose contradicts it, gets a still track of its own.
+
+    Args:
+        folder: Holds what the module describes.
+        event_unit: Of the event times, where it is not what the data sets have (ns without
+            `ev_map.npz`, us with it).
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    variant = variant_of(folder)
+    pictures = choose_images(folder, None)
+    paths = list_images(pictures)
+    table = read_poses_bounds(folder / "poses_bounds.npy")
+    exposure = _exposure(pictures / "timestamps.npz")
+    _expect_one_each(folder, images=len(paths), poses=len(table), exposures=len(exposure))
+    images = read_images(paths)
+    camera = _camera(images, table, factor=_factor(pictures))
+    along, path = _trajectory(folder)
+    bounds = (along if variant.reference_poses == "trajectory" else table).bounds
+    off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
+    trajectory, track = _tracks(path, table, off)
+    events, notes = _events(folder, camera, path, event_unit=event_unit, variant=variant)
+    names = tuple(file.stem for file in paths)
+    truth, truth_known = _truth(folder / "truth.npz", names, images)
+    return Capture(
+        camera=camera,
+        trajectory=trajectory,
+        clock=path.clock,
+        near=float(bounds.min()),
+        far=float(bounds.max()),
+        frames=Frames(images, exposure, track, names, variant.encoding, truth, truth_known),
+        events=events,
+        split=split_by_rule(len(paths), variant.hold_out),
+        name=folder.resolve().name,
+        source=LAYOUT,
+        notes=notes
+        | {REFERENCE: variant.reference_poses}
+        | ({"frames_off_trajectory": ", ".join(np.array(names)[off])} if off.any() else {}),
+    )
+
+
+def _exposure(path: Path) -> Exposure:
+    times = load_arrays(path)
+    columns = []
+    for name in ("timestamps_start", "timestamps_end"):
+        if name not in times:
+            raise CaptureError(
+                f"array {name} is missing",
+                where=path,
+                got=", ".join(times) or "no arrays",
+                do="store when each exposure began and ended, in us",
+            )
+        columns.append(whole_us(times[name], "us", f"{path}, {name}"))
+    _expect_one_each(path, starts=len(columns[0]), ends=len(columns[1]))
+    return Exposure(*columns)
+
+
+def _trajectory(folder: Path) -> tuple[PosesBounds, Stamped]:
+    poses_file, times_file = (folder / name for name in TRAJECTORY)
+    for path in (poses_file, times_file):
+        if not path.is_file():
+            raise CaptureError(
+                "poses over time are missing",
+                where=path,
+                got="poses of single frames only",
+                do="give a pose at least every few ms, over all exposures and events;"
+                " one pose per frame does not say how the camera moved between",
+            )
+    table = read_poses_bounds(poses_file)
+    times_us = whole_us(load_array(times_file), "us", times_file)
+    _expect_one_each(f"{poses_file} and {times_file.name}", poses=len(table), times=len(times_us))
+    clock = Clock(int(times_us[0]), max(int(times_us[-1] - times_us[0]), 1))
+    return table, Stamped(times_us, table.poses, clock)
+
+
+def _camera(images: Shaped[np.ndarray, "n h w c"], table: PosesBounds, *, factor: float) -> Camera:
+    """The table's own image size is not used, only its focal length: so did the authors."""
+    height, width = images.shape[1:3]
+    focal = table.focal_px / factor
+    return Camera(width, height, focal, focal, width / 2, height / 2)
+
+
+def _factor(pictures: Path) -> float:
+    match = re.fullmatch(r"images_(\d+)", pictures.name)
+    return float(match[1]) if match else 1.0
+
+
+def _off_trajectory(
+    path: Stamped, table: PosesBounds, exposure: Exposure, camera: Camera, *, near: float
+) -> Bool[np.ndarray, "n"]:
+    """Which frames were not taken on the trajectory."""
+    first, last = path.known_us(0)
+    begin, end = exposure.open_us + HELD_BACK_US, exposure.close_us - HELD_BACK_US
+    outside = exposure.instant & ((begin < first) | (end > last))
+    time = torch.from_numpy(path.clock.unit(exposure.middle_us))
+    expected = path.pose(time, torch.zeros(len(table)).long())
+    twist = se3.log(se3.compose(se3.inverse(expected), torch.from_numpy(table.poses))).numpy()
+    turned, shifted = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
+    return outside | (camera.fx_px * (turned + shifted / near) > OFF_TRAJECTORY_PX)
+
+
+def _tracks(
+    path: Stamped, table: PosesBounds, off: Bool[np.ndarray, "n"]
+) -> tuple[Trajectory, Int64[np.ndarray, "n"]]:
+    """The trajectory with a still track for each frame that is off it, and the track of each."""
+    if not off.any():
+        return path, np.zeros(len(off), np.int64)
+    return Tracks([path], table.poses[off]), np.where(off, np.cumsum(off), 0).astype(np.int64)
+
+
+def _events(
+    folder: Path, camera: Camera, path: Stamped, *, event_unit: str | None, variant: Variant
+) -> tuple[EventStream, Notes]:
+    """Events while the pose is known, and what was done to them."""
+    known_us = path.known_us(0)
+    notes: Notes = dict.fromkeys(THRESHOLDS, variant.threshold)
+    with open_events(folder / "events.h5", unit=event_unit, size=camera.size) as opened:
+        file = opened if opened.unit else replace(opened, unit=variant.event_unit)
+        if len(file):
+            expect_overlap(
+                file.span_us(),
+                known_us,
+                where=file.path,
+                known="poses",
+                do="give the unit of the events, ns or us (`event_unit`)",
+            )
+        events = read_events(file, between=known_us)
+        if len(file) > len(events):
+            notes["events_outside_trajectory"] = float(len(file) - len(events))
+        if file.unit == "ns":
+            notes["event_times"] = "rounded from ns to us"
+        if file.thresholds is not None:
+            notes |= dict(zip(THRESHOLDS, file.thresholds, strict=True))
+    if (folder / "ev_map.npz").is_file():
+        events = replace(events, site_colour=_site_colour(folder / "ev_map.npz", camera))
+    return events, notes
+
+
+def _site_colour(path: Path, camera: Camera) -> SiteColour:
+    maps = load_arrays(path)
+    shape = (camera.height, camera.width)
+    for name in ("inv_mapx", "inv_mapy"):
+        if name not in maps or maps[name].shape != shape:
+            raise CaptureError(
+                f"array {name} is missing, or not of the sensor's size",
+                where=path,
+                got=", ".join(f"{key} {value.shape}" for key, value in maps.items()),
+                do=f"it must be {shape}",
+            )
+    tiled = np.tile(RGGB, (camera.height // 2 + 1, camera.width // 2 + 1))
+    return SiteColour(
+        maps["inv_mapx"].ravel().astype(np.float32),
+        maps["inv_mapy"].ravel().astype(np.float32),
+        tiled[: camera.height, : camera.width].ravel(),
+    )
+
+
+def _truth(
+    path: Path, names: tuple[str, ...], images: Shaped[np.ndarray, "n h w c"]
+) -> tuple[Shaped[np.ndarray, "n h w c"] | None, Bool[np.ndarray, "n"] | None]:
+    """Sharp images by name of the frame, and for which frames there is one."""
+    if not path.exists():
+        return None, None
+    given = load_arrays(path)
+    truth, known = np.zeros_like(images), np.isin(names, list(given))
+    for i in np.flatnonzero(known):
+        image = given[names[i]]
+        if image.shape != images.shape[1:] or image.dtype != images.dtype:
+            raise CaptureError(
+                "sharp image differs from the frame in size or type",
+                where=f"{path}, {names[i]}",
+                got=f"{image.dtype} {image.shape}, frame {images.dtype} {images.shape[1:]}",
+            )
+        truth[i] = image
+    return truth, known
+
+
+def _expect_one_each(where: object, **counts: int) -> None:
+    if len(set(counts.values())) > 1:
+        raise CaptureError(
+            f"there must be as many {' as '.join(counts)}",
+            where=where,
+            got=", ".join(f"{count} {name}" for name, count in counts.items()),
+            do="check for images that were added or removed afterwards",
+        )

@@ -1,0 +1,168 @@
+"""nerfstudio's format: one `transforms.json` with intrinsics, lens and frames.
+
+    fl_x fl_y cx cy w h               for all frames, or in every frame alike
+    camera_model k1 k2 k3 k4 p1 p2    OPENCV, OPENCV_FISHEYE or PINHOLE, and its distortion
+    frames                            file_path, transform_matrix
+    train_filenames, test_filenames, val_filenames     optional
+    ply_file_path                     optional: sparse scene points
+
+Source: nerfstudio's documentation of its data format, and instant-ngp, where it comes from.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts._photos import (
+    HOLD_OUT,
+    Missing,
+    Photos,
+    existing,
+    photo_capture,
+    same_camera,
+)
+from sharpfield.captures.layouts._transforms import (
+    frame_name,
+    frames_of,
+    image_path,
+    number,
+    poses_of,
+    read_json,
+)
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry.normalise import focus
+from sharpfield.storage.images import read_images
+from sharpfield.storage.ply import columns, read_ply
+
+LENSES = {
+    "PINHOLE": ("pinhole", ()),
+    "OPENCV": ("brown", ("k1", "k2", "p1", "p2", "k3")),
+    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
+}
+"""Camera models: our lens, and the keys of its distortion."""
+
+NEAR, FAR = 0.1, 10.0
+"""Guessed depth bounds, as multiples of the cameras' distance from what they look at."""
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder looks like such a scene."""
+    return (folder / "transforms.json").is_file()
+
+
+def read(
+    folder: Path,
+    *,
+    bounds: tuple[float, float] | None = None,
+    missing: Missing = "error",
+    encoding: str = "srgb",
+) -> Capture:
+    """Read a scene.
+
+    Args:
+        folder: Holds `transforms.json`.
+        bounds: Nearest and farthest depth; by default guessed from where the cameras look, since
+            the format does not say.
+        missing: What to do about images that are named but not there.
+        encoding: How stored values relate to light.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    path = folder / "transforms.json"
+    content = read_json(path)
+    frames = sorted(frames_of(content, path), key=lambda frame: frame["file_path"])
+    paths = [image_path(folder, frame["file_path"]) for frame in frames]
+    kept = existing(paths, missing=missing, where=path)
+    frames, paths = [frames[i] for i in kept], [paths[i] for i in kept]
+    names = [frame_name(frame["file_path"]) for frame in frames]
+    poses = poses_of(frames, path)
+    notes = {} if bounds else {"bounds": "guessed from where the cameras look"}
+    photos = Photos(
+        images=read_images(paths),
+        poses=poses,
+        names=names,
+        camera=same_camera([_camera({**content, **f}, path) for f in frames], names, where=path),
+        encoding=encoding,
+    )
+    return photo_capture(
+        photos,
+        _split(content, names, path),
+        bounds=bounds or guessed_bounds(poses),
+        name=folder.resolve().name,
+        source="nerfstudio",
+        points=_points(folder, content, path),
+        notes=notes,
+    )
+
+
+def guessed_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
+    """Depth bounds from the point that all cameras look at, and how far away it is.
+
+    Where the axes are parallel there is none; then it is put at ten times the spread of the
+    cameras.
+    """
+    centre, forward = poses[:, :, 3], poses[:, :, 2]
+    target = focus(poses)
+    if target is not None:
+        depth = float(np.median(((target - centre) * forward).sum(-1)))
+    else:
+        depth = 10 * (float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0)
+    return NEAR * depth, FAR * depth
+
+
+def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.ndarray, "m 3"] | None:
+    named = content.get("ply_file_path")
+    if named is None:
+        return None
+    if not isinstance(named, str):
+        raise CaptureError("`ply_file_path` must be text", where=path, got=named)
+    place = folder / named
+    points = columns(read_ply(place), ("x", "y", "z"), where=place).astype(np.float64)
+    return points if len(points) else None
+
+
+def _camera(content: dict[str, Any], path: Path) -> Camera:
+    model = content.get("camera_model", "OPENCV")
+    if model not in LENSES:
+        raise CaptureError(
+            "camera model is not supported",
+            where=path,
+            got=model,
+            do=f"use one of {', '.join(LENSES)}, or undistort the images",
+        )
+    lens, keys = LENSES[model]
+    bent = tuple(number({key: 0.0, **content}, key, path) for key in keys)
+    if not any(bent) and lens == "brown":
+        lens, bent = "pinhole", ()
+    fx = number(content, "fl_x", path)
+    fy = number({"fl_y": fx, **content}, "fl_y", path)
+    cx, cy = number(content, "cx", path), number(content, "cy", path)
+    width, height = round(number(content, "w", path)), round(number(content, "h", path))
+    return Camera(width, height, fx, fy, cx, cy, lens, bent)
+
+
+def _split(content: dict[str, Any], names: list[str], path: Path) -> Split:
+    listed = {
+        kind: {frame_name(file) for file in content.get(f"{kind}_filenames", [])}
+        for kind in ("train", "test", "val")
+    }
+    if not any(listed.values()):
+        return split_by_rule(len(names), HOLD_OUT)
+    test = listed["test"] or listed["val"]
+    train = listed["train"] or set(names) - test
+    known = np.array(names)
+    split = Split(
+        train=np.flatnonzero(np.isin(known, sorted(train))),
+        test=np.flatnonzero(np.isin(known, sorted(test))),
+    )
+    if not len(split.train):
+        raise CaptureError(
+            "none of the frames is for training", where=f"{path}, key `train_filenames`"
+        )
+    return split

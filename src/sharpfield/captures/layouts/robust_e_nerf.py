@@ -1,0 +1,201 @@
+"""Robust e-NeRF's data (Deblur e-NeRF's too): one event camera that moves.
+
+    raw_events.npz            position [n, 2], timestamp in ns, polarity
+    camera_poses.npz          T_wc_position, T_wc_orientation (quaternion x y z w), T_wc_timestamp;
+                              world-from-camera, OpenCV axes
+    camera_calibration.npz    intrinsics, distortion, img_height, img_width, bayer_pattern,
+                              thresholds, refractory period in ns
+    views/transforms_test.json, or ../views/     pictures to be predicted, if there are any
+
+Intrinsics count pixels from the centre of the first, ours from its corner. Poses are joined by
+straight lines. Pictures of another size than the event camera's, or not PNG or JPEG, are left out,
+and the notes say so.
+
+Source: Low and Lee, *Robust e-NeRF* (ICCV 2023), and its data loader.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Shaped
+
+from sharpfield.captures.layouts._transforms import (
+    frame_name,
+    frames_of,
+    image_path,
+    poses_of,
+    read_json,
+)
+from sharpfield.captures.layouts.nerfstudio import guessed_bounds
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream, checked
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry import se3
+from sharpfield.geometry.trajectory import Stamped, Tracks
+from sharpfield.storage.arrays import load_arrays
+from sharpfield.storage.event_columns import coordinates, polarity, whole_us
+from sharpfield.storage.images import SUFFIXES, read_images
+
+EVENTS, POSES, CALIBRATION = "raw_events.npz", "camera_poses.npz", "camera_calibration.npz"
+
+LENSES = {"plumb_bob": ("brown", (0.0,)), "equidistant": ("fisheye", ())}
+"""Distortion models: our lens, and the coefficients that follow their four."""
+
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder looks like such data."""
+    return all((folder / file).is_file() for file in (EVENTS, POSES, CALIBRATION))
+
+
+def read(folder: Path) -> Capture:
+    """Read the events, the poses, and the pictures to be predicted.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    calibration = _arrays(folder / CALIBRATION, ("intrinsics", "img_height", "img_width"))
+    camera = _camera(calibration, folder / CALIBRATION)
+    path = _trajectory(folder / POSES)
+    events = _events(folder / EVENTS, camera, str(calibration.get("bayer_pattern", "")))
+    near, far = guessed_bounds(path.poses)
+    views = _views(folder, camera, path.clock)
+    notes: dict[str, Note] = {"bounds": "guessed from where the camera looks"}
+    notes |= _notes(calibration) | ({"views": views.left_out} if views.left_out else {})
+    none = np.zeros(0, np.int64)
+    return Capture(
+        camera=camera,
+        trajectory=path if views.frames is None else Tracks([path], views.poses),
+        clock=path.clock,
+        near=near,
+        far=far,
+        frames=views.frames,
+        events=events,
+        split=Split(none, np.arange(len(views.poses))),
+        name=folder.resolve().name,
+        source="robust-e-nerf",
+        notes=notes,
+    )
+
+
+def _arrays(path: Path, needed: tuple[str, ...]) -> Arrays:
+    found = load_arrays(path)
+    lacking = [name for name in needed if name not in found]
+    if lacking:
+        raise CaptureError(
+            f"array {lacking[0]} is missing", where=path, got=", ".join(found) or "no arrays"
+        )
+    return found
+
+
+def _camera(calibration: Arrays, path: Path) -> Camera:
+    matrix = np.asarray(calibration["intrinsics"], np.float64)
+    bent = np.atleast_1d(np.asarray(calibration.get("distortion_params", []), np.float64))
+    model = str(calibration.get("distortion_model", ""))
+    lens, distortion = "pinhole", ()
+    if bent.size and bent.any():
+        if model not in LENSES or bent.shape != (4,):
+            raise CaptureError(
+                "distortion model is not supported",
+                where=path,
+                got=f"{model!r} with {bent.size} coefficients",
+                do=f"use one of {', '.join(LENSES)} with 4, or undistort the events",
+            )
+        lens, more = LENSES[model]
+        distortion = (*bent.tolist(), *more)
+    width, height = (int(calibration[name].item()) for name in ("img_width", "img_height"))
+    fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
+    cx, cy = float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5
+    return Camera(width, height, fx, fy, cx, cy, lens, distortion)
+
+
+def _trajectory(path: Path) -> Stamped:
+    names = ("T_wc_position", "T_wc_orientation", "T_wc_timestamp")
+    found = _arrays(path, names)
+    position, xyzw, stamps = (found[name] for name in names)
+    if not (len(position) == len(xyzw) == len(stamps) > 1):
+        raise CaptureError(
+            "there must be a position, an orientation and a time for each of several poses",
+            where=path,
+            got=f"{len(position)}, {len(xyzw)} and {len(stamps)}",
+        )
+    wxyz = torch.from_numpy(np.roll(np.asarray(xyzw, np.float64), 1, axis=1))
+    rotation = se3.rotation_from_quaternion(wxyz / wxyz.norm(dim=-1, keepdim=True)).numpy()
+    poses = np.concatenate([rotation, np.asarray(position, np.float64)[:, :, None]], -1)
+    times_us = whole_us(stamps, "ns", path)
+    clock = Clock(int(times_us[0]), max(int(times_us[-1] - times_us[0]), 1))
+    return Stamped(times_us, poses, clock, "linear")
+
+
+def _events(path: Path, camera: Camera, bayer: str) -> EventStream:
+    found = _arrays(path, ("position", "timestamp", "polarity"))
+    position = found["position"]
+    if position.ndim != 2 or position.shape[1] != 2:
+        raise CaptureError("positions must be pairs", where=path, got=f"shape {position.shape}")
+    events = EventStream(
+        x=coordinates(np.ascontiguousarray(position[:, 0]), "x", path),
+        y=coordinates(np.ascontiguousarray(position[:, 1]), "y", path),
+        t_us=whole_us(found["timestamp"], "ns", path),
+        p=polarity(found["polarity"], path),
+        width=camera.width,
+        height=camera.height,
+        bayer=bayer,
+    )
+    return checked(events, path)
+
+
+def _notes(calibration: Arrays) -> dict[str, Note]:
+    """Thresholds and dead time, where they are known (a real camera's are NaN or absent)."""
+    given = {
+        "threshold_on": ("pos_contrast_threshold", 1.0),
+        "threshold_off": ("neg_contrast_threshold", 1.0),
+        "refractory_us": ("refractory_period", 1e-3),
+    }
+    notes: dict[str, Note] = {}
+    for note, (name, scale) in given.items():
+        value = float(calibration[name].item()) if name in calibration else np.nan
+        if np.isfinite(value):
+            notes[note] = value * scale
+    return notes
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Pictures to be predicted, each on a still track of its own."""
+
+    frames: Frames | None = None
+    poses: Float64[np.ndarray, "v 3 4"] = field(default_factory=lambda: np.zeros((0, 3, 4)))
+    left_out: str = ""
+    """Why there are none, though some are listed."""
+
+
+def _views(folder: Path, camera: Camera, clock: Clock) -> _Views:
+    listed = [
+        parent / "views" / f"transforms_{name}.json"
+        for parent in (folder, folder.resolve().parent)
+        for name in ("test", "val")
+    ]
+    path = next((file for file in listed if file.is_file()), None)
+    if path is None:
+        return _Views()
+    frames = frames_of(read_json(path), path)
+    files = [image_path(path.parent, frame["file_path"]) for frame in frames]
+    if not all(file.is_file() for file in files):
+        return _Views(left_out=f"{path.name} names images that are not {' or '.join(SUFFIXES)}")
+    images = read_images(files, alpha="white")
+    if images.shape[1:3] != (camera.height, camera.width):
+        return _Views(left_out=f"{path.name} is of a camera of another size")
+    at = np.full(len(frames), clock.origin_us)
+    seen = Frames(
+        images=images,
+        exposure=Exposure(at, at),
+        track=1 + np.arange(len(frames)),
+        names=tuple(frame_name(frame["file_path"]) for frame in frames),
+        encoding="srgb",
+    )
+    return _Views(seen, poses_of(frames, path))

@@ -1,0 +1,173 @@
+"""ScanNet scenes, and whatever else was exported to their layout (Habitat renders, for instance).
+
+    color/0.jpg, ...           RGB; `rgb/` and PNG are found, too
+    depth/0.png, ...           16 bit, millimetres, 0 where unknown; of another size than colour
+    pose/0.txt, ...            4x4, world from camera; -inf, or no file, where tracking failed
+    intrinsic/intrinsic_color.txt, intrinsic_depth.txt     4x4
+    truth/0.png, truth/blur_px.txt    ours: sharp frames and true blur, where simulated
+    SCENE_vh_clean.ply         optional, here or above: vertices of the reconstructed mesh
+
+All of it lies in the scene's folder or in `exported/` there. Colour larger than 640x480 is brought
+to that size, and one frame in five is learned from, as Point-NeRF and Hybrid Neural Rendering
+published it.
+
+Source: Dai et al., *ScanNet* (CVPR 2017).
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layouts._rgbd import (
+    BOUNDS,
+    RgbdFrames,
+    pinhole,
+    read_matrix,
+    read_pose,
+    rgbd_capture,
+    usable_poses,
+)
+from sharpfield.captures.native.frames import decode_depth
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError
+from sharpfield.storage.images import SUFFIXES, read_image
+from sharpfield.storage.mapped_images import mapped
+from sharpfield.storage.ply import columns, read_ply
+
+PUBLISHED_SPLIT = "train:5"
+"""One frame in five is learned from, see `captures.hold_out`."""
+COLOUR, DEPTH, POSE, TRUTH = ("color", "rgb"), "depth", "pose", "truth"
+BLUR = "blur_px.txt"
+INTRINSIC_COLOUR = Path("intrinsic") / "intrinsic_color.txt"
+INTRINSIC_DEPTH = Path("intrinsic") / "intrinsic_depth.txt"
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder has this layout, itself or in `exported/`."""
+    place = _place(folder)
+    return (place / POSE).is_dir() and (place / INTRINSIC_COLOUR).is_file() and bool(_colour(place))
+
+
+def read(
+    folder: Path,
+    *,
+    hold_out: str = PUBLISHED_SPLIT,
+    bounds: tuple[float, float] = BOUNDS,
+    encoding: str = "srgb",
+) -> Capture:
+    """Read a scene.
+
+    Args:
+        folder: Holds what the module describes.
+        hold_out: Which frames to hold out.
+        bounds: Nearest and farthest depth, in metres.
+        encoding: How stored values relate to light.
+
+    Raises:
+        CaptureError: Something is missing, malformed, or does not fit together.
+    """
+    place = _place(folder)
+    colour = _colour(place)
+    names = [path.stem for path in colour]
+    first = read_image(colour[0])
+    maps = [place / DEPTH / f"{name}.png" for name in names]
+    measured = np.array([path.is_file() for path in maps])
+    camera = pinhole(
+        read_matrix(place / INTRINSIC_COLOUR), first.shape[1::-1], where=place / INTRINSIC_COLOUR
+    )
+    frames = RgbdFrames(
+        names=names,
+        poses=np.stack([_pose(place / POSE / f"{name}.txt") for name in names]),
+        colour=lambda row: rgb(colour[row]),
+        depth=lambda row: decode_depth(maps[row]),
+        measured=measured,
+        camera=camera,
+        depth_camera=_depth_camera(place, maps[int(np.argmax(measured))]) or camera,
+        sources=colour,
+        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
+    )
+    made = rgbd_capture(
+        frames,
+        lambda count: split_by_rule(count, hold_out),
+        folder=folder,
+        source="scannet",
+        bounds=bounds,
+        encoding=encoding,
+        points=_mesh(folder),
+    )
+    return _with_truth(made, place, np.flatnonzero(usable_poses(frames.poses)))
+
+
+def rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """A colour image of 8 bit.
+
+    Raises:
+        CaptureError: It is something else.
+    """
+    image = read_image(path)
+    if image.dtype != np.uint8:
+        raise CaptureError("a colour image must have 8 bits", where=path, got=image.dtype)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.shape[-1] == 1 else image
+
+
+def by_number(folder: Path) -> list[Path]:
+    """Images of a folder in the order of the numbers in their names."""
+    found = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
+    return sorted(found, key=_number)
+
+
+def _number(path: Path) -> tuple[int, Path]:
+    return int("".join(filter(str.isdigit, path.stem)) or -1), path
+
+
+def _place(folder: Path) -> Path:
+    return folder / "exported" if (folder / "exported").is_dir() else folder
+
+
+def _colour(place: Path) -> list[Path]:
+    for name in COLOUR:
+        if found := by_number(place / name):
+            return found
+    return []
+
+
+def _pose(path: Path) -> Float64[np.ndarray, "3 4"]:
+    return read_pose(path) if path.is_file() else np.full((3, 4), np.nan)
+
+
+def _depth_camera(place: Path, path: Path) -> Camera | None:
+    """That of a depth map; None if the map is not there."""
+    if not path.is_file():
+        return None
+    matrix = read_matrix(place / INTRINSIC_DEPTH)
+    return pinhole(matrix, decode_depth(path).shape[::-1], where=place / INTRINSIC_DEPTH)
+
+
+def _mesh(folder: Path) -> Float64[np.ndarray, "m 3"] | None:
+    for path in sorted(folder.glob("*_vh_clean.ply")):
+        return columns(read_ply(path), ("x", "y", "z"), where=path).astype(np.float64)
+    return None
+
+
+def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> Capture:
+    """The sharp frames that a simulation wrote beside, and how blurred the others are."""
+    frames, notes = capture.needed_frames, dict(capture.notes)
+    paths = [place / TRUTH / f"{name}.png" for name in frames.names]
+    known = np.array([path.is_file() for path in paths])
+    if known.any():
+        unknown = np.zeros(frames.images.shape[1:], np.uint8)
+        truth = mapped(
+            paths,
+            lambda path: rgb(path) if path.is_file() else unknown,
+            sources=[path for path in paths if path.is_file()],
+            kind="truth",
+        )
+        frames = replace(frames, truth=truth, truth_known=known)
+    if (place / TRUTH / BLUR).is_file():
+        notes["blur_px"] = read_matrix(place / TRUTH / BLUR)[kept, 0]
+    return replace(capture, frames=frames, notes=notes)

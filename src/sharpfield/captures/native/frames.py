@@ -1,0 +1,246 @@
+"""Measured depth in our own layout: `[depth]` with its unit and camera, and PNG files in `depth/`.
+
+The files have the names of the frames' own, 16 bit, grey, 0 where nothing was measured.
+
+Frames in our own layout: a line each in `[frames] each`, and PNG files in `frames/`, `truth/`.
+
+A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
+"none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
+defaults in brackets. `truth/depth.npy` and `truth/flow.npy` are of all frames, where known.
+`[frames] row_delay_us` (0) is that of a rolling shutter.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Shaped, UInt16
+
+from sharpfield.captures.native.trajectory import camera_table, read_camera
+from sharpfield.core.capture import Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.frames import DepthMaps, Exposure, Frames
+from sharpfield.storage.arrays import load_array
+from sharpfield.storage.images import describe, read_image, write_image
+from sharpfield.storage.mapped_images import mapped, mapped_images
+from sharpfield.storage.toml_tables import Table
+
+DEPTH = "depth"
+
+
+def write_depth(depth: DepthMaps, files: Sequence[str], folder: Path) -> dict[str, Any]:
+    """Write the maps under the names of the frames' files, and return what describes them."""
+    for file, stored in zip(files, depth.stored, strict=True):
+        write_image(folder / DEPTH / file, np.asarray(stored)[..., None])
+    return {"unit": depth.unit, "camera": camera_table(depth.camera)}
+
+
+def read_depth(about: Table, files: Sequence[str], folder: Path) -> DepthMaps:
+    """Read what `write_depth` wrote.
+
+    Raises:
+        CaptureError: A map is missing or malformed.
+    """
+    about.expect_only("unit", "camera")
+    paths = [folder / DEPTH / file for file in files]
+    return DepthMaps(
+        mapped_images(paths, decode_depth, kind="depth"),
+        read_camera(about.table("camera")),
+        about.number("unit"),
+    )
+
+
+def decode_depth(path: Path) -> UInt16[np.ndarray, "h w"]:
+    """A depth map as stored.
+
+    Raises:
+        CaptureError: The file is missing, or not a grey image of 16 bit.
+    """
+    image = read_image(path)
+    if image.dtype != np.uint16 or image.shape[-1] != 1:
+        raise CaptureError(
+            "a depth map must be a grey image of 16 bit", where=path, got=describe(image)
+        )
+    return image[..., 0]
+
+
+FRAMES, TRUTH = "frames", "truth"
+GEOMETRY = {"depth": (), "flow": (2,)}
+"""Fields of `Frames` that are kept as arrays of one entry per pixel, and their trailing shape."""
+
+USES = {(True, False): "train", (False, True): "test", (True, True): "both", (False, False): "none"}
+"""What `use` says of a frame, by whether it is learned from and whether it is held out."""
+
+PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth")
+
+
+def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, Any]]:
+    """Write the images, and return the lines that describe the frames.
+
+    Raises:
+        CaptureError: The truth is of another size or type than the images, or the split is not
+            in the order of frames.
+    """
+    _expect_same_kind(frames)
+    for part in (split.train, split.test):
+        if (np.diff(part) <= 0).any():
+            raise CaptureError("a split must name frames in ascending order, each once", got=part)
+    index = np.arange(len(frames))
+    learned, held_out = np.isin(index, split.train), np.isin(index, split.test)
+    files = files_of(frames.names)
+    tables = []
+    for i, file in enumerate(files):
+        write_image(folder / FRAMES / file, frames.images[i])
+        table: dict[str, Any] = {
+            "name": frames.names[i],
+            "open_us": int(frames.exposure.open_us[i]),
+            "close_us": int(frames.exposure.close_us[i]),
+            "track": int(frames.track[i]),
+            "use": USES[bool(learned[i]), bool(held_out[i])],
+        }
+        if file != f"{frames.names[i]}.png":
+            table["file"] = file
+        if frames.truth is not None:
+            table["truth"] = bool(frames.with_truth[i])
+            if table["truth"]:
+                write_image(folder / TRUTH / file, frames.truth[i])
+        tables.append(table)
+    for name in GEOMETRY:
+        if (values := getattr(frames, name)) is not None:
+            (folder / TRUTH).mkdir(exist_ok=True)
+            np.save(folder / TRUTH / f"{name}.npy", values)
+    return tables
+
+
+def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
+    """Read what `write_frames` wrote: the frames, their split, and the names of their files.
+
+    Raises:
+        CaptureError: A line or an image is missing or malformed, or images differ in size.
+    """
+    about.expect_only("encoding", "row_delay_us", "each")
+    tables = about.tables("each")
+    for table in tables:
+        table.expect_only(*KEYS)
+    names = tuple(table.text("name") for table in tables)
+    files = [_inside(table, folder) for table in tables]
+    images = mapped_images([folder / FRAMES / file for file in files], read_image, kind="frames")
+    truth, known = _read_truth(tables, [folder / TRUTH / file for file in files], images)
+    frames = Frames(
+        images=images,
+        exposure=Exposure(
+            *(_column([table.whole(key) for table in tables]) for key in ("open_us", "close_us")),
+            row_delay_us=about.number("row_delay_us", 0.0),
+        ),
+        track=_column([table.whole("track", 0) for table in tables]),
+        names=names,
+        encoding=about.text("encoding"),
+        truth=truth,
+        truth_known=known,
+        **_read_geometry(folder / TRUTH, images),
+    )
+    return frames, _split(tables), files
+
+
+def _read_truth(
+    tables: Sequence[Table], paths: Sequence[Path], images: Shaped[np.ndarray, "n h w c"]
+) -> tuple[Shaped[np.ndarray, "n h w c"] | None, Shaped[np.ndarray, "n"] | None]:
+    known = np.array([table.yes("truth", False) for table in tables])
+    if not known.any():
+        return None, None
+    there = [path for path, one in zip(paths, known, strict=True) if one]
+    first = read_image(there[0])
+    _expect_like(first[None], images, paths[0].parent)
+    unknown = np.zeros_like(first)
+    truth = mapped(
+        list(zip(paths, known.tolist(), strict=True)),
+        lambda item: read_image(item[0]) if item[1] else unknown,
+        sources=there,
+        kind="truth",
+    )
+    _expect_like(truth, images, paths[0].parent)
+    return truth, known
+
+
+def _expect_like(
+    found: Shaped[np.ndarray, "m y x c"], images: Shaped[np.ndarray, "n h w d"], where: Path
+) -> None:
+    if found.shape[1:] != images.shape[1:] or found.dtype != images.dtype:
+        raise CaptureError(
+            "sharp images differ from the frames in size or type",
+            where=where,
+            got=f"{describe(found[0])}, frames {describe(images[0])}",
+        )
+
+
+def _read_geometry(
+    folder: Path, images: Shaped[np.ndarray, "n h w c"]
+) -> dict[str, Float32[np.ndarray, "..."]]:
+    """Depth and flow of all frames, those that are there."""
+    found = {}
+    for name, trailing in GEOMETRY.items():
+        path = folder / f"{name}.npy"
+        if not path.exists():
+            continue
+        values = load_array(path)
+        expected = (*images.shape[:3], *trailing)
+        if values.shape != expected or values.dtype != np.float32:
+            raise CaptureError(
+                f"{name} differs from the frames in size or type",
+                where=path,
+                got=f"{values.dtype} {values.shape}, expected float32 {expected}",
+            )
+        found[name] = values
+    return found
+
+
+def _split(tables: Sequence[Table]) -> Split:
+    meaning = {use: key for key, use in USES.items()}
+    chosen = []
+    for table in tables:
+        use = table.text("use", "train")
+        if use not in meaning:
+            raise CaptureError(
+                "unknown use of a frame",
+                where=table.where,
+                got=use,
+                do=f"write one of {', '.join(meaning)}",
+            )
+        chosen.append(meaning[use])
+    learned, held_out = np.array(chosen).T
+    return Split(train=np.flatnonzero(learned), test=np.flatnonzero(held_out))
+
+
+def files_of(names: Sequence[str]) -> list[str]:
+    """The names themselves where every file system can hold them, else numbers."""
+    different = len({name.casefold() for name in names}) == len(names)
+    if different and all(PLAIN_NAME.fullmatch(name) for name in names):
+        return [f"{name}.png" for name in names]
+    return [f"{i:06d}.png" for i in range(len(names))]
+
+
+def _inside(table: Table, folder: Path) -> str:
+    """The file of a frame, which must lie in the capture's own folder."""
+    file = table.text("file", f"{table.text('name')}.png")
+    root = (folder / FRAMES).resolve()
+    if not (root / file).resolve().is_relative_to(root):
+        raise CaptureError("a frame's file lies outside the capture", where=table.where, got=file)
+    return file
+
+
+def _expect_same_kind(frames: Frames) -> None:
+    truth = frames.truth
+    if truth is None:
+        return
+    if truth.shape != frames.images.shape or truth.dtype != frames.images.dtype:
+        raise CaptureError(
+            "sharp images must have the size and type of the frames",
+            got=f"{truth.dtype} {truth.shape}, frames {frames.images.dtype} {frames.images.shape}",
+        )
+
+
+def _column(values: Sequence[int]) -> Shaped[np.ndarray, "n"]:
+    return np.array(values, np.int64)

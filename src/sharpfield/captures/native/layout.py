@@ -1,0 +1,259 @@
+"""Our own layout. Writing a capture and reading it again gives exactly the same capture.
+
+capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes: to be read
+frames/NAME.png    8 or 16 bit, grey or RGB
+truth/NAME.png     sharp images at mid-exposure, where known
+depth/NAME.png     what a depth camera measured, 16 bit, if there was one
+events.h5          see `storage.event_writer`
+test_events.h5     likewise, of held-out cameras, if any
+truth/depth.npy, truth/flow.npy     of all frames, where known; see `Frames`
+trajectory.npz     see `captures.native_trajectory`
+points.npy         sparse scene points, if any
+notes.npz          notes that are arrays, if any
+cache/             derived; delete it when you like
+
+A capture that was just recorded has no poses yet. It is kept with a camera that stands still, and
+the note `poses = "unknown"` says that this is only a stand-in.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sharpfield.captures.clocks import expect_overlap
+from sharpfield.captures.native.frames import (
+    files_of,
+    read_depth,
+    read_frames,
+    write_depth,
+    write_frames,
+)
+from sharpfield.captures.native.trajectory import (
+    camera_table,
+    read_camera,
+    read_trajectory,
+    write_trajectory,
+)
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.events import EventStream
+from sharpfield.core.files import replacing_folder
+from sharpfield.core.frames import Frames
+from sharpfield.core.protocols import Trajectory
+from sharpfield.geometry.trajectory import count_tracks
+from sharpfield.storage.arrays import expect_replaceable, load_array, load_arrays, write_arrays
+from sharpfield.storage.event_cache import read_events
+from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import write_events
+from sharpfield.storage.toml_tables import Table, read_toml, toml_text
+
+FORMAT, VERSION = "sharpfield-capture", 1
+
+DESCRIPTION = "capture.toml"
+EVENTS, TEST_EVENTS = "events.h5", "test_events.h5"
+POINTS = "points.npy"
+NOTES = "notes.npz"
+POSES, INTRINSICS, BOUNDS, UNKNOWN = "poses", "intrinsics", "bounds", "unknown"
+"""Notes that say of poses, focal length and depth bounds that nobody knows them yet."""
+
+NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
+
+
+def recognise(folder: Path) -> bool:
+    """Whether a folder has our own layout."""
+    return (folder / DESCRIPTION).is_file()
+
+
+def write(capture: Capture, folder: Path | str) -> None:
+    """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
+
+    Raises:
+        CaptureError: The folder holds something that is not a capture, or the capture holds
+            something the layout has no place for.
+    """
+    folder = Path(folder)
+    expect_replaceable(folder, recognise)
+    with replacing_folder(folder) as fresh:
+        frames = depth = None
+        if capture.frames is not None:
+            frames = write_frames(capture.frames, capture.split, fresh)
+            if capture.depth is not None:
+                depth = write_depth(capture.depth, files_of(capture.frames.names), fresh)
+        if capture.events is not None:
+            write_events(fresh / EVENTS, capture.events)
+        if capture.test_events is not None:
+            write_events(fresh / TEST_EVENTS, capture.test_events)
+        describe(capture, fresh, frames=frames, depth=depth)
+
+
+def describe(
+    capture: Capture,
+    folder: Path,
+    *,
+    frames: list[dict[str, Any]] | None,
+    depth: dict[str, Any] | None = None,
+) -> None:
+    """Write all that is not pictures or events, for which these must be in the folder already.
+
+    Args:
+        capture: Of which images and events are not looked at.
+        folder: Where the description goes.
+        frames: The line of each frame, see `captures.native_frames`.
+        depth: The table of measured depth, see `captures.native_depth`.
+    """
+    arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
+    about: dict[str, Any] = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": capture.name,
+        "source": capture.source,
+        "near": float(capture.near),
+        "far": float(capture.far),
+        "camera": camera_table(capture.camera),
+        "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
+        "trajectory": write_trajectory(capture.trajectory, folder),
+        "notes": {
+            k: note.item() if isinstance(note, np.generic) else note
+            for k, note in capture.notes.items()
+            if k not in arrays
+        },
+    }
+    if frames is not None:
+        held = capture.needed_frames
+        about["frames"] = {"encoding": held.encoding, "each": frames}
+        if held.exposure.row_delay_us:
+            about["frames"]["row_delay_us"] = float(held.exposure.row_delay_us)
+    if depth is not None:
+        about["depth"] = depth
+    if capture.points is not None:
+        np.save(folder / POINTS, capture.points)
+    if arrays:
+        write_arrays(folder / NOTES, arrays)
+    (folder / DESCRIPTION).write_text(toml_text(about), encoding="utf-8")
+
+
+def read(folder: Path) -> Capture:
+    """Read a capture.
+
+    Raises:
+        CaptureError: Something is missing or malformed, does not fit together, or nobody knows
+            the poses yet.
+    """
+    return expect_poses(read_unposed(folder), folder)
+
+
+def expect_poses(capture: Capture, where: object) -> Capture:
+    """The capture itself, once it is known that its poses are no stand-in.
+
+    Raises:
+        CaptureError: They are.
+    """
+    if capture.notes.get(POSES) == UNKNOWN:
+        raise CaptureError(
+            "nobody knows yet where the camera was",
+            where=where,
+            got=f'a note `{POSES} = "{UNKNOWN}"`',
+            do="find the poses with `sharpfield poses`, or ingest the recording with --poses FILE",
+        )
+    return capture
+
+
+def read_unposed(folder: Path) -> Capture:
+    """Read a capture, whether its poses are known or not: what comes before training needs none.
+
+    Where they are not, `notes["poses"]` is "unknown" and the trajectory is a camera that stands
+    still at the origin. Likewise `notes["intrinsics"]` is "unknown" where the focal length is only
+    a stand-in (the image's width), and `notes["bounds"]` where `near` and `far` are.
+
+    Raises:
+        CaptureError: Something is missing or malformed, or does not fit together.
+    """
+    about = read_toml(folder / DESCRIPTION)
+    _expect_version(about)
+    about.expect_only(
+        *("format", "version", "name", "source", "near", "far", "camera", "clock"),
+        *("trajectory", "notes", "frames", "depth", "events"),
+    )
+    timing = about.table("clock")
+    clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
+    camera = read_camera(about.table("camera"))
+    frames, split, depth = None, NO_SPLIT, None
+    if "frames" in about.values:
+        frames, split, files = read_frames(about.table("frames"), folder)
+        if "depth" in about.values:
+            depth = read_depth(about.table("depth"), files, folder)
+    notes = dict(about.table("notes", optional=True).values)
+    if (folder / NOTES).exists():
+        notes |= load_arrays(folder / NOTES)
+    trajectory = read_trajectory(about.table("trajectory"), folder, clock)
+    streams = [
+        _read_events(about, folder / file, camera, clock) if (folder / file).exists() else None
+        for file in (EVENTS, TEST_EVENTS)
+    ]
+    _expect_tracks(trajectory, frames, streams, where=folder)
+    return Capture(
+        camera=camera,
+        trajectory=trajectory,
+        clock=clock,
+        near=about.number("near"),
+        far=about.number("far"),
+        frames=frames,
+        events=streams[0],
+        test_events=streams[1],
+        split=split,
+        depth=depth,
+        points=load_array(folder / POINTS) if (folder / POINTS).exists() else None,
+        name=about.text("name", folder.resolve().name),
+        source=about.text("source", "native"),
+        notes=notes,
+    )
+
+
+def _read_events(about: Table, path: Path, camera: Camera, clock: Clock) -> EventStream:
+    """The events; `[events] unit` is for files made elsewhere, which may not say it."""
+    unit = about.table("events", optional=True).text("unit", "")
+    with open_events(path, unit=unit or None) as file:
+        sized = file if file.size else replace(file, size=camera.size)
+        if len(sized):
+            expect_overlap(
+                sized.span_us(),
+                (clock.origin_us, clock.origin_us + clock.span_us),
+                where=path,
+                known="the capture's clock",
+                do=f'give the unit in {DESCRIPTION}: [events] unit = "ns"',
+            )
+        return read_events(sized)
+
+
+def _expect_tracks(
+    trajectory: Trajectory,
+    frames: Frames | None,
+    streams: list[EventStream | None],
+    *,
+    where: Path,
+) -> None:
+    """Make sure that frames and events are of tracks the trajectory knows."""
+    known = count_tracks(trajectory)
+    named = [] if frames is None else [frames.track]
+    named += [one.track for one in streams if one is not None and one.track is not None]
+    for track in named:
+        if len(track) and not (0 <= track.min() and track.max() < known):
+            raise CaptureError(
+                "a frame or an event is of a track that has no poses",
+                where=where,
+                got=f"tracks {track.min()} to {track.max()}, {known} with poses",
+            )
+
+
+def _expect_version(about: Table) -> None:
+    found = about.text("format"), about.whole("version")
+    if found != (FORMAT, VERSION):
+        raise CaptureError(
+            "unknown format of capture",
+            where=about.where,
+            got=f"{found[0]} version {found[1]}",
+            do=f"this program reads {FORMAT} version {VERSION}",
+        )

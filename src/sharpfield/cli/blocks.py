@@ -1,0 +1,130 @@
+"""The command that trains a long capture in blocks: here, or shared out by torchrun."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from sharpfield.captures.blocks import blocks_of
+from sharpfield.captures.read import read
+from sharpfield.cli.arguments import Device, screen
+from sharpfield.cli.runs import OPTIONS, READING, Choice, changed
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.recipes import recipe_named
+from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.splats.merge import merge
+from sharpfield.runs.config import Started, read_started, write_started
+from sharpfield.runs.run import Reading, device_named, open_run, start
+from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
+from sharpfield.training.optim import adam
+from sharpfield.training.plan import Options
+from sharpfield.training.record import Ledger, read_ledger, write_ledger
+
+FOLDER = "blocks"
+"""Of the runs of the blocks, in the run they make together."""
+
+
+@dataclass(frozen=True)
+class Cut(Choice):
+    """What of the recipe, and of the capture, is used, and in how many blocks."""
+
+    count: int = 2
+    """Blocks that the capture is cut into."""
+
+
+CUT = Cut()
+
+
+def blocks(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    seed: int = 0,
+    device: Device = "auto",
+    choice: Cut = CUT,
+    options: Options = OPTIONS,
+    reading: Reading = READING,
+) -> None:
+    """Train a long capture in overlapping blocks, and merge them into one run.
+
+    The same command goes on where an earlier one stopped. To train blocks side by side, start it by
+    torchrun, which restarts workers that die:
+    `torchrun --nproc-per-node 2 --max-restarts 3 --no-python sharpfield blocks ...`.
+
+    Args:
+        recipe: One of those made of Gaussians, such as room-splat.
+        capture: Folder of the capture.
+        out: Folder of the merged run; the blocks' own runs are in it.
+        seed: Of everything random.
+        device: Where to train.
+        choice: Presets, streams, single numbers, blocks.
+        options: How long, how often to save, how much memory; for each block.
+        reading: What to believe instead of the capture's layout.
+    """
+    if choice.block:
+        raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
+    console, where, count = screen(), device_named(device), choice.count
+    source = read(capture, **reading.given())
+    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = changed(made, choice.change)
+    whole = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
+    runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
+    started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
+    for run, block in zip(runs, started, strict=True):
+        if read_ledger(run) is not None:  # finished ones are not opened again
+            check_settings(read_started(run).settings(), block.settings())
+    for i in _mine(count, os.environ):
+        block, done = started[i], read_ledger(runs[i])
+        if done is not None and done.finished:
+            continue
+        console.print(f"Block {block.block}")
+        going_on = replace(options, resume=options.resume or done is not None)
+        start(block, source, runs[i], going_on, device=where, console=console)
+    ledgers = [ledger for run in runs if (ledger := read_ledger(run)) is not None]
+    if len(ledgers) == count and all(ledger.finished for ledger in ledgers):
+        together = _together(ledgers)
+        if not _up_to_date(whole, together, out, runs):
+            _merge(whole, source, out, runs, together)
+        console.print(f"Merged. `sharpfield evaluate {out}` measures it.")
+
+
+def _mine(count: int, environment: Mapping[str, str]) -> range:
+    """The blocks of this process, as torchrun numbers processes; all if it did not start it."""
+    rank, world = int(environment.get("RANK", 0)), int(environment.get("WORLD_SIZE", 1))
+    return range(rank, count, world)
+
+
+def _together(ledgers: list[Ledger]) -> Ledger:
+    """What all blocks cost."""
+    steps = max(ledger.planned_steps for ledger in ledgers)
+    return Ledger(
+        planned_steps=steps,
+        parts=1,
+        device=ledgers[0].device,
+        steps=steps,
+        seconds=sum(ledger.seconds for ledger in ledgers),
+        peak_memory_mb=max(ledger.peak_memory_mb for ledger in ledgers),
+    )
+
+
+def _up_to_date(whole: Started, together: Ledger, out: Path, runs: list[Path]) -> bool:
+    """Whether the merged run was made of these blocks, as they are now."""
+    if read_ledger(out) != together:  # written last
+        return False
+    check_settings(read_started(out).settings(), whole.settings())
+    merged, *blocks = (file_of(run, "last").stat().st_mtime_ns for run in (out, *runs))
+    return all(block <= merged for block in blocks)
+
+
+def _merge(whole: Started, source: Capture, out: Path, runs: list[Path], together: Ledger) -> None:
+    """Write the merged run: what all workers that get here write is the same."""
+    models = [open_run(run, device="cpu").model for run in runs]
+    merged: Any = merge(models, blocks_of(source, len(runs)))
+    write_started(out, whole)
+    progress = Progress(together.steps, together.steps, settings=whole.settings())
+    save_last(out, merged, adam(merged), progress)
+    write_ledger(out, together)

@@ -1,0 +1,40 @@
+"""`sharpfield calibrate`: contrast thresholds of the event camera, from frames and events."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.read import read_unposed
+from sharpfield.cli.arguments import screen
+from sharpfield.preparation.calibrate.calibrate import CalibrateOptions
+from sharpfield.preparation.calibrate.calibrate import calibrate as measure
+from sharpfield.preparation.calibrate.report import PICTURE, as_text, write_calibration
+
+MEASURING = CalibrateOptions()
+
+
+def calibrate(
+    capture: Positional[Path],
+    out: Path,
+    write_capture: Path | None = None,
+    options: CalibrateOptions = MEASURING,
+) -> None:
+    """Measure the thresholds of the event camera from frames and events, and find odd pixels.
+
+    Args:
+        capture: Folder of the capture; its poses are not looked at.
+        out: Folder for `calibration.json`, `pixels.npz` and `pixels.png`.
+        write_capture: Also write the capture, with the thresholds found, to this folder.
+        options: How much to look at.
+    """
+    held = read_unposed(capture)
+    made = measure(held, options)
+    about = write_calibration(held, made, out)
+    console = screen()
+    console.print(as_text(about), soft_wrap=True)
+    console.print(f"Numbers and a map of the pixels are in {out}; see {out / PICTURE}")
+    if write_capture is not None:
+        notes = held.notes | {"threshold_off": made.negative, "threshold_on": made.positive}
+        native.write(replace(held, notes=notes, name=write_capture.name), write_capture)

@@ -1,0 +1,118 @@
+"""`sharpfield poses`: find where the camera was, or attach what something else says of it."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from tyro.conf import Positional
+
+from sharpfield.captures.native import layout as native
+from sharpfield.captures.paths.pose_layouts import OuterPath, PathLayout, read_hand_eye, read_path
+from sharpfield.captures.read import read_unposed
+from sharpfield.cli.arguments import screen
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import OptionError
+from sharpfield.core.files import write_json
+from sharpfield.preparation.poses.external import Mount, attach, known_at
+from sharpfield.preparation.poses.find import PoseOptions, find_poses
+from sharpfield.preparation.poses.report import as_text, summary, write_page
+from sharpfield.storage.arrays import expect_replaceable
+
+REPORT, PAGE = "poses.json", "poses.html"
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Poses that another program, a tracker or an encoder knows."""
+
+    trajectory: Path | None = None
+    """A file of poses to take instead of finding them."""
+    align: Path | None = None
+    """A file of poses whose world the poses found are to be brought into."""
+    layout: PathLayout | None = None
+    """Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap."""
+    offset_ms: float = 0.0
+    """Added to the times of that file."""
+    hand_eye: Path | None = None
+    """Where the camera sits on the body the file tracks: a matrix, or x y z qx qy qz qw."""
+    bounds: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
+    """Nearest and farthest depth, with --trajectory, where the frames do not show them."""
+
+    def __post_init__(self) -> None:
+        if self.trajectory is not None and self.align is not None:
+            raise OptionError(
+                "give either --trajectory or --align", got=f"{self.trajectory} and {self.align}"
+            )
+
+    def mount(self) -> Mount:
+        """How the body and the clock of the file relate to the camera's."""
+        hand = None if self.hand_eye is None else read_hand_eye(self.hand_eye)
+        return Mount(round(1000 * self.offset_ms), hand)
+
+
+FINDING, ELSEWHERE = PoseOptions(), Elsewhere()
+
+
+def poses(
+    capture: Positional[Path],
+    out: Path,
+    options: PoseOptions = FINDING,
+    elsewhere: Elsewhere = ELSEWHERE,
+) -> None:
+    """Find where the camera was from the frames, deblurred with the events, or attach known poses.
+
+    Args:
+        capture: Folder of the capture; poses it has are not looked at.
+        out: Folder of the new capture, with `poses.json` and `poses.html`.
+        options: Pictures, lens.
+        elsewhere: Poses from a file.
+    """
+    expect_replaceable(out, native.recognise)
+    original, mount = read_unposed(capture), elsewhere.mount()
+    if elsewhere.trajectory is not None:
+        path = read_path(elsewhere.trajectory, elsewhere.layout)
+        _attach(original, path, mount, elsewhere.bounds, out)
+        return
+    known = None
+    if elsewhere.align is not None:
+        known = partial(known_at, read_path(elsewhere.align, elsewhere.layout), mount)
+    found = find_poses(original, options, known=known)
+    native.write(replace(found.capture, name=out.name), out)
+    about = summary(original, found)
+    write_json(out / REPORT, about)
+    write_page(out / PAGE, original, found, about)
+    console = screen()
+    console.print(as_text(about), soft_wrap=True)
+    console.print(f"The capture with poses is in {out}; open {out / PAGE}", soft_wrap=True)
+
+
+def _attach(
+    original: Capture,
+    path: OuterPath,
+    mount: Mount,
+    bounds: tuple[float, float] | None,
+    out: Path,
+) -> None:
+    attached = attach(original, path, mount, bounds=bounds)
+    made = attached.capture
+    native.write(replace(made, name=out.name), out)
+    names: tuple[str, ...] = () if original.frames is None else original.frames.names
+    lost = [str(names[int(i)]) for i in np.setdiff1d(np.arange(len(names)), attached.kept)]
+    about = {
+        "capture": original.name,
+        "poses_from": path.layout,
+        "poses": len(path.poses),
+        "offset_us": mount.offset_us,
+        "covered_us": attached.covered_us,
+        "frames": {"before": len(names), "after": len(attached.kept), "left_out": lost},
+        "bounds": {"near": made.near, "far": made.far},
+    }
+    write_json(out / REPORT, about)
+    said = f"{len(path.poses)} poses ({path.layout}) attached; {len(attached.kept)} of"
+    said += f" {len(names)} frames and {len(made.events or ()):,} events are covered"
+    if lost:
+        said += f"; left out: {', '.join(lost[:8])}{', ...' if len(lost) > 8 else ''}"
+    screen().print(f"{said}\nThe capture with poses is in {out}")

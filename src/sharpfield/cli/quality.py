@@ -1,0 +1,85 @@
+"""Commands about blur: judge the frames of a capture, blur pictures."""
+
+import json as json_format
+from pathlib import Path
+
+from rich.table import Table
+from tyro.conf import Positional
+
+from sharpfield.captures.read import read
+from sharpfield.cli.arguments import screen
+from sharpfield.preparation.quality import (
+    QualityOptions,
+    as_table,
+    blur_pictures,
+    judged,
+    quality_to,
+)
+from sharpfield.simulation.sensors.motion_kernel import INTENSITY, PROBABILITY, SIZE, KernelRange
+
+JUDGING = QualityOptions()
+SHOWN = 12
+"""Frames that are printed."""
+
+
+def quality(
+    capture: Positional[Path],
+    json: bool = False,
+    out: Path | None = None,
+    layout: str | None = None,
+    options: QualityOptions = JUDGING,
+) -> None:
+    """Say which frames of a video are sharp, whatever they show, and what weight that earns them.
+
+    Args:
+        capture: Folder of the capture.
+        json: Print JSON with the score and weight of every frame.
+        out: Folder for `quality.json`, `ranking.png` and `weights.npy`.
+        layout: Of the capture, if it is not recognised.
+        options: How frames are judged.
+    """
+    held = read(capture, layout=layout)
+    found, told_by = judged(held, options)
+    about = as_table(held, found, told_by)
+    if out is not None:
+        quality_to(held, found, told_by, out)
+    if json:
+        print(json_format.dumps(about, indent=2))
+        return
+    console = screen()
+    ranked = sorted(about["frames"], key=lambda row: row["score"])
+    shown = ranked if len(ranked) <= SHOWN else [*ranked[: SHOWN // 2], *ranked[-SHOWN // 2 :]]
+    columns = list(shown[0])
+    table = Table(*columns, title=f"{len(ranked)} frames, blurriest first, judged by {told_by}")
+    for row in shown:
+        cells = [row[key] if key == "name" else f"{row[key]:.3g}" for key in columns]
+        table.add_row(*cells)
+    console.print(table)
+    if "rank_correlation" in about:
+        said = f"Rank correlation with the true sharpness: {about['rank_correlation']:.3f}"
+        console.print(said)
+    if out is not None:
+        console.print(f"The ranking is in {out}")
+
+
+def blur(
+    images: Positional[Path],
+    out: Path,
+    k: tuple[int, int] = SIZE,
+    phi: tuple[float, float] = INTENSITY,
+    probability: float = PROBABILITY,
+    seed: int = 0,
+) -> None:
+    """Blur sharp pictures by random motion kernels, as Hybrid Neural Rendering did its test data.
+
+    Args:
+        images: Folder of PNG or JPEG pictures.
+        out: Folder for the blurred ones, of the same names and sizes, and `blur.json`.
+        k: Smallest size of a kernel in px, and the one above the largest.
+        phi: Least and greatest intensity: how crooked a stroke is, 0...1.
+        probability: Share of pictures that are blurred.
+        seed: Of all kernels.
+    """
+    made = blur_pictures(images, out, ranges=KernelRange(k, phi, probability), seed=seed)
+    count = sum(row["blurred"] for row in made)
+    screen().print(f"{count} of {len(made)} pictures were blurred; see {out}")

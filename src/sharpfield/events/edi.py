@@ -1,0 +1,159 @@
+"""The event double integral: a sharp picture from a blurred one and the events of its exposure.
+
+Motion blur averages light over the exposure, B = mean of I(t), and events tell how the light of
+each pixel moved, I(t) = I(f) exp(E(t) - E(f)), with E the change of log light since the shutter
+opened. So
+
+    I(f) = B exp(E(f)) / mean of exp(E(t)).
+
+The mean is `exp(path.log_mean)` and E(f) is `path.change`, see `formation.log_path`. This holds for
+linear light; `latent_in_light` decodes stored values first. The published Ev-DeblurNeRF code
+applies it to stored values, with a path made of eight slices: `published`.
+
+Sources: Pan et al., "Bringing a Blurry Frame Alive at High Frame-Rate with an Event Camera"
+(CVPR 2019), and its extension to several exposures (TPAMI 2020).
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sharpfield.core.events import EventStream
+from sharpfield.core.tone import Tone
+from sharpfield.events.image import splat_bilinear
+from sharpfield.events.log_path import LogPath
+from sharpfield.events.threshold import FixedThresholds
+
+STAMPS = 9
+"""Instants of an exposure in the published integral; the middle one is index 4."""
+
+FLOOR = 1e-4
+"""Linear light added before a logarithm: half a step of 8 bits in the darkest tones."""
+
+
+def latent(blurred: Float[Tensor, "h w c"], path: LogPath, instant: int) -> Float[Tensor, "h w c"]:
+    """The sharp picture at one of the path's instants, in the domain of `blurred`; not clipped.
+
+    A path of one channel moves all colours alike.
+    """
+    return blurred * torch.exp(path.change[instant] - path.log_mean)
+
+
+def latent_in_light(
+    stored: Float[Tensor, "h w c"], path: LogPath, instant: int, tone: Tone
+) -> Float[Tensor, "h w c"]:
+    """The same for stored values, computed in linear light; stored values, clipped to 0...1."""
+    return tone.encode(latent(tone.decode(stored), path, instant).clamp(0, 1))
+
+
+def path_of_instants(slices: Float[Tensor, "j h w c"]) -> LogPath:
+    """A path from its change in each of j slices, averaged over the j + 1 borders.
+
+    The published rule. It takes the light at the borders for the light of the whole exposure.
+    """
+    change = _borders(slices)
+    return LogPath(log_mean=change.logsumexp(0) - math.log(len(change)), change=change)
+
+
+def published_slices(
+    events: EventStream,
+    window_us: tuple[int, int],
+    thresholds: FixedThresholds,
+    *,
+    stamps: int = STAMPS,
+) -> Float[Tensor, "j h w 1"]:
+    """Change of log light in each of `stamps - 1` slices, as the released code cuts them.
+
+    Both ends of a slice belong to it, so that an event exactly on an inner border counts twice.
+    Rectified positions are shared bilinearly among the pixels around them; whatever its colour, an
+    event moves all channels.
+    """
+    borders = np.linspace(*window_us, stamps)
+    first = np.searchsorted(events.t_us, borders[:-1], side="left")
+    last = np.searchsorted(events.t_us, borders[1:], side="right")
+    size = {"width": events.width, "height": events.height}
+    slices = [
+        splat_bilinear(
+            np.stack([part.x, part.y], -1).astype(np.float32),
+            np.where(part.p > 0, thresholds.positive, -thresholds.negative)[:, None],
+            **size,
+        )
+        for part in (events[int(a) : int(b)] for a, b in zip(first, last, strict=True))
+    ]
+    return torch.as_tensor(np.stack(slices), dtype=torch.float32)
+
+
+def published(
+    stored: Float[Tensor, "h w c"],
+    events: EventStream,
+    window_us: tuple[int, int],
+    thresholds: FixedThresholds,
+) -> Float[Tensor, "h w c"]:
+    """The target C_EDI of the released Ev-DeblurNeRF: middle of the exposure, stored values.
+
+    Nothing is linearised or clipped: values above 1 occur.
+    """
+    path = path_of_instants(published_slices(events, window_us, thresholds))
+    return latent(stored, path, STAMPS // 2)
+
+
+def path_of_slices(slices: Float[Tensor, "j h w c"]) -> LogPath:
+    """A path from its change in each of j slices, moving evenly inside each.
+
+    The average of exp along a straight line is (exp b - exp a) / (b - a): exact for the broken line
+    through the borders, so that few slices are enough.
+    """
+    change = _borders(slices)
+    return LogPath(
+        log_mean=(change[:-1] + _log_mean_of_line(slices)).logsumexp(0) - math.log(len(slices)),
+        change=change,
+    )
+
+
+def _borders(slices: Float[Tensor, "j h w c"]) -> Float[Tensor, "k h w c"]:
+    return torch.cat([torch.zeros_like(slices[:1]), slices.cumsum(0)])
+
+
+def _log_mean_of_line(rise: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Log of the mean of exp along a line from 0 to `rise`: log((exp r - 1) / r), safe at 0."""
+    half = rise / 2
+    small = half.abs() < 1e-2
+    safe = torch.where(small, torch.ones_like(half), half)
+    series = half.square() / 6
+    return half + torch.where(small, series, torch.log(torch.sinh(safe) / safe))
+
+
+def joint_latents(
+    alone: Float[Tensor, "n h w c"],
+    gaps: Float[Tensor, "g h w c"],
+    *,
+    trust: Float[Tensor, "g h w c"] | float = 1.0,
+) -> Float[Tensor, "n h w c"]:
+    """Log light of n pictures that agrees with every exposure and with the events in between.
+
+    Per pixel, least squares of one equation per exposure, x_i = alone_i, and one per gap,
+    x_{i+1} - x_i = gaps_i. The normal equations are tridiagonal and are solved for all pixels at
+    once, forwards and backwards along the pictures.
+
+    Args:
+        alone: What each exposure says by itself: log B_i + E(f_i) - log_mean_i.
+        gaps: Change of log light from each picture to the next, g = n - 1.
+        trust: Weight of each gap's equation; an exposure's is 1.
+    """
+    links = torch.ones_like(gaps) * trust
+    none = torch.zeros_like(alone[:1])
+    before, after = torch.cat([none, links]), torch.cat([links, none])
+    pull = torch.cat([none, links * gaps]) - torch.cat([links * gaps, none])
+    diagonal, right = 1 + before + after, alone + pull
+    pivot, reduced = [diagonal[0]], [right[0]]
+    for i in range(1, len(alone)):
+        ratio = before[i] / pivot[-1]
+        pivot.append(diagonal[i] - ratio * before[i])
+        reduced.append(right[i] + ratio * reduced[-1])
+    found = [reduced[-1] / pivot[-1]]
+    for i in range(len(alone) - 2, -1, -1):
+        found.append((reduced[i] + after[i] * found[-1]) / pivot[i])
+    return torch.stack(found[::-1])

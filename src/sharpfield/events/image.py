@@ -1,0 +1,82 @@
+"""Pictures of events: values at scattered positions summed into the pixels of an image.
+
+Positions are in index units (10.0 is the centre of pixel 10); what falls outside is dropped.
+"""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from numba import njit
+
+from sharpfield.events.index import EventIndex, counts, window
+
+
+def splat_nearest(
+    xy: Float32[np.ndarray, "m 2"], value: Float64[np.ndarray, "m c"], *, width: int, height: int
+) -> Float64[np.ndarray, "h w c"]:
+    """Add each value to the pixel whose centre is nearest (halves go to the higher pixel)."""
+    image = np.zeros((height, width, value.shape[1]))
+    _nearest(xy, value, image)
+    return image
+
+
+def splat_bilinear(
+    xy: Float32[np.ndarray, "m 2"], value: Float64[np.ndarray, "m c"], *, width: int, height: int
+) -> Float64[np.ndarray, "h w c"]:
+    """Share each value among the four pixels around it, by (1 - |dx|) (1 - |dy|).
+
+    A value exactly on a pixel goes there entirely.
+    """
+    image = np.zeros((height, width, value.shape[1]))
+    _bilinear(xy, value, image)
+    return image
+
+
+def window_image(
+    index: EventIndex, start_us: int, end_us: int, *, width: int, height: int, track: int = 0
+) -> Float64[np.ndarray, "h w 2"]:
+    """How many events with start <= t < end got darker and brighter at each pixel.
+
+    Rectified positions are shared bilinearly, so that counts need not be whole numbers.
+
+    Args:
+        index: The events.
+        start_us: The first instant that counts.
+        end_us: The first that no longer does.
+        width: Of the picture.
+        height: Of the picture.
+        track: Whose events.
+    """
+    site = index.sites_of(track)
+    start, end = np.full(len(site), start_us), np.full(len(site), end_us)
+    found = counts(index, *window(index, site, start, end))
+    value = np.stack(found, -1).astype(np.float64)
+    return splat_bilinear(index.site_xy[site], value, width=width, height=height)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _add(image: Float[np.ndarray, "h w c"], row, column, weight, value) -> None:
+    if 0 <= row < image.shape[0] and 0 <= column < image.shape[1]:
+        for c in range(image.shape[2]):
+            image[row, column, c] += weight * value[c]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _nearest(xy, value, image):
+    for i in range(len(xy)):
+        column, row = int(np.floor(xy[i, 0] + 0.5)), int(np.floor(xy[i, 1] + 0.5))
+        _add(image, row, column, 1.0, value[i])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _bilinear(xy, value, image):
+    for i in range(len(xy)):
+        left, top = int(np.floor(xy[i, 0])), int(np.floor(xy[i, 1]))
+        right_share, lower_share = xy[i, 0] - left, xy[i, 1] - top
+        for row, share in ((top, 1 - lower_share), (top + 1, lower_share)):
+            _add(image, row, left, share * (1 - right_share), value[i])
+            _add(image, row, left + 1, share * right_share, value[i])

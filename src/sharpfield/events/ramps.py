@@ -1,0 +1,205 @@
+"""How far each pixel is on its way from one event to the next.
+
+An event says that a whole threshold is behind; at any other time the log light of a pixel is
+somewhere between its last event and its next one. Where both have the same sign, the light has
+been moving one way, and the share of the time between them tells the share of the threshold: the
+*phase*. Where they differ the light turned around at a height nobody knows, less than a threshold
+beyond the last event. If every height is as likely and the light turns as a thrown stone does, it
+spent the time a third of a threshold beyond, on average, and only at last fell to the next event.
+Left out, this *overshoot* is what makes counts of events too few after a turn, and thresholds
+that explain them too large.
+
+The log light of every pixel as a broken line through its events, instead of a staircase.
+
+A staircase rises when a threshold is already behind, so that all it says is late, by a millisecond
+or so: pictures made from it show where things were. Between two events a *ramp* lets the light
+move in the last part of the time before the second one. Where light turns it has gone a little
+beyond its last event, see `formation.event_phase`.
+"""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numba import njit
+from torch import Tensor
+
+from sharpfield.events.index import EventIndex, first_since
+
+LONGEST_US = 20_000
+"""Between two events farther apart than this the light may have stood still for a while."""
+
+OVERSHOOT = 1 / 3
+"""Mean height beyond the last event until the light turns back: half of a threshold at the top,
+two thirds of that over the time. Half as much before another event of the same sign."""
+
+FALL_US, FALL_SHARE = 4_000, 0.4
+"""The light falls to its next event within this time, or this share of the time between the two."""
+
+
+def phase_at(
+    index: EventIndex, time_us: int, *, width: int, height: int
+) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """The signed part of an event that each pixel saw since its last one, and where it is known.
+
+    Args:
+        index: Of a mono sensor whose events name pixels, so that its sites are the pixels.
+        time_us: By the clock of the events.
+        width: Of the sensor.
+        height: Of the sensor.
+
+    Returns:
+        -1...1, what is likely where it is not known; and whether it is known.
+    """
+    assert index.sites == width * height, "sites are the pixels of the sensor"
+    phase = np.zeros(index.sites, np.float32)
+    known = np.zeros(index.sites, np.bool_)
+    _phases(index.offset, index.t_us, index.p, time_us, phase, known)
+    shape = height, width
+    return torch.as_tensor(phase.reshape(shape)), torch.as_tensor(known.reshape(shape))
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _phases(offset, t_us, p, time_us, phase, known):
+    for site in range(len(phase)):
+        first, low, high = offset[site], offset[site], offset[site + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if t_us[middle] <= time_us:
+                low = middle + 1
+            else:
+                high = middle
+        if low == first:
+            continue
+        if low == offset[site + 1]:
+            phase[site] = OVERSHOOT * p[low - 1]
+            continue
+        gap, since, same = t_us[low] - t_us[low - 1], time_us - t_us[low - 1], p[low] == p[low - 1]
+        if same and gap <= LONGEST_US:
+            known[site] = True
+            phase[site] = p[low] * since / max(gap, 1)
+            continue
+        beyond = OVERSHOOT * p[low - 1] * (0.5 if same else 1.0)
+        fall = min(FALL_US, FALL_SHARE * gap)
+        fallen = min(max(1 - (gap - since) / fall, 0.0), 1.0) if fall > 0 else 0.0
+        phase[site] = (1 - fallen) * beyond + fallen * p[low]
+
+
+RAMP_US = 7_000
+"""Longest ramp; what moves slower stood still before. 5 to 10 ms serve a hand-held camera best."""
+
+
+def ramp_at(index: EventIndex, time_us: int, size: tuple[int, int]) -> Float[Tensor, "h w 2"]:
+    """Parts of an event to darker (-1...0) and to brighter (0...1) since the last one.
+
+    Args:
+        index: Of a mono sensor whose events name pixels.
+        time_us: By the clock of the events.
+        size: Width and height.
+    """
+    parts = np.zeros((index.sites, 2), np.float32)
+    _ramps(index.offset, index.t_us, index.p, time_us, parts)
+    return torch.as_tensor(parts.reshape(size[1], size[0], 2))
+
+
+def ramped_log_mean(
+    index: EventIndex,
+    window_us: tuple[int, int],
+    thresholds: tuple[float, float],
+    size: tuple[int, int],
+) -> Float[Tensor, "h w 1"]:
+    """Log of the time average of exp(change since the opening) over one exposure.
+
+    Args:
+        index: Of a mono sensor whose events name pixels.
+        window_us: Opening and closing of the shutter, by the clock of the events.
+        thresholds: To darker and to brighter.
+        size: Width and height.
+    """
+    mean = np.zeros(index.sites)
+    if window_us[1] > window_us[0]:
+        _log_means(index.offset, index.t_us, index.p, window_us, thresholds, mean)
+    return torch.as_tensor(mean.reshape(size[1], size[0], 1), dtype=torch.float32)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _begin(t_us, first, event):
+    """When the ramp to an event begins."""
+    begin = t_us[event] - RAMP_US
+    return max(begin, t_us[event - 1]) if event > first else begin
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _beyond(t_us, p, first, event, last):
+    """Signed height of the light beyond the event before this one, until the ramp, in events."""
+    if event == first:
+        return 0.0
+    height = OVERSHOOT * p[event - 1]
+    if event == last or p[event] != p[event - 1]:
+        return height
+    return 0.5 * height if t_us[event] - t_us[event - 1] > LONGEST_US else 0.0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _ramps(offset, t_us, p, time_us, parts):
+    for site in range(len(parts)):
+        first, last = offset[site], offset[site + 1]
+        event = first_since(t_us, first, last, time_us + 1)
+        risen = 0.0
+        if event < last:
+            begin = _begin(t_us, first, event)
+            if time_us > begin:
+                risen = (time_us - begin) / (t_us[event] - begin)
+                parts[site, 1 if p[event] > 0 else 0] = risen * p[event]
+        beyond = _beyond(t_us, p, first, event, last)
+        parts[site, 1 if beyond > 0 else 0] += (1 - risen) * beyond
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _area(level, begin, end, slope_from, step, ramp):
+    """Integral of exp(level + ramp) from one time to another; the ramp rises from `slope_from`."""
+    flat_end = min(max(slope_from, begin), end)
+    area = math.exp(level) * (flat_end - begin)
+    if end > flat_end:
+        low = level + step * (flat_end - slope_from) / ramp
+        high = level + step * (end - slope_from) / ramp
+        if abs(high - low) < 1e-6:
+            area += math.exp(low) * (end - flat_end)
+        else:
+            area += (math.exp(high) - math.exp(low)) / (high - low) * (end - flat_end)
+    return area
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _log_means(offset, t_us, p, window_us, thresholds, mean):
+    opens, closes = window_us
+    for site in range(len(mean)):
+        first, last = offset[site], offset[site + 1]
+        event = first_since(t_us, first, last, opens + 1)
+        now, level, area, started = opens, 0.0, 0.0, False
+        while now < closes:
+            end, slope_from, step, ramp = closes, closes, 0.0, 1.0
+            beyond = _beyond(t_us, p, first, event, last)
+            beyond *= thresholds[1] if beyond > 0 else thresholds[0]
+            if event < last:
+                slope_from = _begin(t_us, first, event)
+                step = thresholds[1] if p[event] > 0 else -thresholds[0]
+                ramp = max(t_us[event] - slope_from, 1)
+                end = min(closes, t_us[event])
+            if not started:
+                # Relative to the opening, which may lie on a ramp.
+                level = -beyond - (step - beyond) * max(opens - slope_from, 0) / ramp
+                started = True
+            area += _area(level + beyond, now, end, slope_from, step - beyond, ramp)
+            level += step
+            now = end
+            event += 1
+        mean[site] = math.log(area / (closes - opens))

@@ -1,0 +1,229 @@
+"""Where neural points start: on the surfaces that depth maps, or a sparse cloud, tell of."""
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int64
+from torch import Tensor
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.seed import generator
+from sharpfield.core.tone import tone_of
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.initialisation.fused_points import fuse_points
+from sharpfield.initialisation.posed_images import sharp_pictures
+from sharpfield.initialisation.start_points import starting_points
+from sharpfield.storage.result_cache import kept
+
+PAIRS = 1 << 20
+"""Of points and cameras, looked at at once: few enough to stay close to the processor."""
+
+FAR_OFF = 200.0
+"""World units that count as much as a right angle to the axis, when a camera is chosen."""
+
+GUESSED = 20_000
+"""Points where neither depth nor a budget is known."""
+
+FEW = 4.0
+"""Mean number of points in occupied cubes two spacings wide."""
+
+HALVINGS = 16
+"""Of the interval in which the spacing is looked for: to a part in several thousand."""
+
+
+@dataclass(frozen=True)
+class CloudOptions:
+    """The points, and where they come from."""
+
+    budget: int = 0
+    """About how many of them; 0 for one in each voxel."""
+    voxel: float = 0.0
+    """Edge of the voxels that depth is fused in, in world units; 0 takes a 900th of the scene."""
+    frames: Literal["train", "all"] = "train"
+    """Whose depth is fused. The released code takes all frames, held-out ones included."""
+    nearest: float = 0.3
+    """Smaller depth is left out."""
+    farthest: float = 8.0
+    """Larger depth is left out."""
+    colours: Literal["camera", "fused"] = "camera"
+    """Of one camera, as published, or means over all that see a point."""
+    noise: float = 0.0
+    """Standard deviation of noise on the places, in world units; the paper studies 0.05."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points to start from."""
+
+    positions: Float32[np.ndarray, "n 3"]
+    colours: Float32[np.ndarray, "n c"]
+    """As frames store them."""
+    directions: Float32[np.ndarray, "n 3"]
+    """Unit vectors from a camera that sees each."""
+    spacing: float
+    """Typical distance to the next point."""
+
+    def __len__(self) -> int:
+        """Number of points."""
+        return len(self.positions)
+
+
+def starting_cloud(
+    options: CloudOptions,
+    capture: Capture,
+    seed: int,
+    *,
+    weight: Float[np.ndarray, "a"] | None = None,
+) -> Cloud:
+    """Points on the surfaces of a capture; those of a long one are kept, see `captures.kept`.
+
+    Args:
+        options: How many, and from where.
+        capture: With depth, points, or frames alone, whose depth is then guessed.
+        seed: Of the run.
+        weight: How much each frame counts for colours.
+    """
+    weights = None if weight is None else weight.tolist()
+    about = {"options": asdict(options), "seed": seed, "weight": weights}
+    found = kept(capture, "points", about, lambda: _found(options, capture, seed, weight))
+    return Cloud(found["positions"], found["colours"], found["directions"], float(found["spacing"]))
+
+
+def _found(
+    options: CloudOptions, capture: Capture, seed: int, weight: Float[np.ndarray, "a"] | None
+) -> dict[str, np.ndarray]:
+    """What `Cloud` holds."""
+    if capture.depth is not None:
+        positions, colours = _fused(options, capture, weight)
+    else:
+        positions, colours = _guessed(options, capture, seed)
+    if options.noise:
+        made = generator(seed, 0, "noise on points")
+        drawn = torch.randn(positions.shape, generator=made).numpy()
+        positions = positions + np.float32(options.noise) * drawn
+    frame, directions = first_cameras(capture, torch.from_numpy(positions))
+    if options.colours == "camera":
+        colours = colours_seen(capture, torch.from_numpy(positions), frame).numpy()
+    return {
+        "positions": positions,
+        "colours": np.ascontiguousarray(colours[:, : capture.needed_frames.channels]),
+        "directions": directions.numpy(),
+        "spacing": np.array(typical_spacing(positions)),
+    }
+
+
+def typical_spacing(positions: Float32[np.ndarray, "n 3"]) -> float:
+    """Distance between neighbours of points on surfaces: half the cubes that hold four of them."""
+    low = positions.min(0)
+    extent = float(np.ptp(positions, axis=0).max())
+    small, large = 1e-6, extent + 1e-6
+    for _ in range(HALVINGS):
+        edge = (small * large) ** 0.5
+        cell = ((positions - low) / edge).astype(np.int64)
+        number = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+        occupied = 1 + np.count_nonzero(np.diff(np.sort(number)))
+        crowded = len(positions) > FEW * occupied
+        small, large = (small, edge) if crowded else (edge, large)
+    return (small * large) ** 0.5 / 2
+
+
+def first_cameras(
+    capture: Capture, positions: Float[Tensor, "n 3"]
+) -> tuple[Int64[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """The training frame that each point belongs to, and the direction in which it sees it.
+
+    The frame is near, and looks towards the point; whether something hides it is not asked.
+
+    Source: the released code of Hybrid Neural Rendering.
+    """
+    train = torch.as_tensor(capture.split.train)
+    pose = capture.frame_pose(capture.split.train).detach().float()
+    place, axis = pose[:, :, 3], pose[:, :, 2]
+    middle = place.mean(0)  # sums of squares lose less when they are small
+    square, own = (place - middle).square().sum(-1), ((place - middle) * axis).sum(-1)
+    best = []
+    for part in (positions - middle).split(max(PAIRS // len(train), 1)):
+        away = torch.addmm(square, part, (place - middle).T, alpha=-2)
+        away = away.add_(part.square().sum(-1, keepdim=True)).clamp_min_(1e-12).sqrt_()
+        along = torch.addmm(own, part, axis.T, beta=-1).div_(away)
+        best.append(along.sub_(away.div_(FAR_OFF)).argmax(-1))
+    chosen = torch.cat(best)
+    way = positions - place[chosen]
+    return train[chosen], way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+
+
+def colours_seen(
+    capture: Capture, positions: Float[Tensor, "n 3"], frame: Int64[Tensor, "n"]
+) -> Float[Tensor, "n c"]:
+    """What one frame each shows where points are; 0 outside its image."""
+    frames, camera = capture.needed_frames, capture.camera
+    found = torch.zeros(len(positions), frames.channels)
+    order = frame.argsort(stable=True)
+    asked, counts = frame.unique(return_counts=True)
+    poses = capture.frame_pose(asked.numpy()).detach().float()
+    for one, pose, here in zip(asked.tolist(), poses, order.split(counts.tolist()), strict=True):
+        seen = (positions[here] - pose[:, 3]) @ pose[:, :3]
+        ahead = seen[:, 2] > 1e-6
+        xy = camera.project(torch.where(ahead[:, None], seen, torch.tensor([0.0, 0.0, 1.0])))
+        image = torch.from_numpy(np.asarray(frames.images[one]).astype(np.float32)) / frames.white
+        grid = xy / xy.new_tensor(camera.size) * 2 - 1
+        colour = torch.nn.functional.grid_sample(
+            image.permute(2, 0, 1)[None], grid[None, None], align_corners=False
+        )[0, :, 0].T
+        found[here] = colour * ahead[:, None]
+    return found
+
+
+def _fused(
+    options: CloudOptions, capture: Capture, weight: Float[np.ndarray, "a"] | None
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+    voxel = options.voxel or _ninehundredth(options, capture)
+
+    def fused(edge: float) -> tuple[np.ndarray, np.ndarray]:
+        assert capture.depth is not None
+        cloud = fuse_points(
+            capture,
+            frames=options.frames,
+            stride=1 if capture.depth.camera.width <= 320 else 2,
+            voxel=edge,
+            nearest=options.nearest,
+            farthest=options.farthest,
+            weight=weight,
+        )
+        return cloud.points, cloud.colours
+
+    positions, colours = fused(voxel)
+    for _ in range(3):  # points on surfaces grow with the square of how fine voxels are
+        if not options.budget or len(positions) <= 1.1 * options.budget:
+            break
+        voxel *= (len(positions) / options.budget) ** 0.5
+        positions, colours = fused(voxel)
+    return positions, colours
+
+
+def _ninehundredth(options: CloudOptions, capture: Capture) -> float:
+    """Of the edge of a cube a little larger than the scene."""
+    coarse = (options.farthest if np.isfinite(options.farthest) else capture.far) / 50
+    rough = fuse_points(
+        capture,
+        frames=options.frames,
+        stride=8,
+        voxel=coarse,
+        nearest=options.nearest,
+        farthest=options.farthest,
+    )
+    return 1.05 * float(np.ptp(rough.points, axis=0).max()) / 900
+
+
+def _guessed(
+    options: CloudOptions, capture: Capture, seed: int
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n c"]]:
+    """Pixels drawn by chance, as deep as a sparse cloud around them."""
+    tone = tone_of(capture.needed_frames.encoding)
+    pictures = sharp_pictures(capture.without(events=True), FixedThresholds(1.0, 1.0))
+    count = options.budget or GUESSED
+    made = generator(seed, 0, "cloud")
+    start = starting_points(pictures, count, made, known=capture.points)
+    return start.points, tone.encode(torch.from_numpy(start.colours)).clamp(0, 1).numpy()

@@ -1,0 +1,233 @@
+"""Poses from elsewhere, attached to a capture: other programs, motion capture, motor encoders.
+
+A file tracks a *body* on a clock of its own. The pose of the camera is the body's, followed by
+where the camera sits on it (hand-eye, body-from-camera); a time of the capture is a time of the
+file plus an offset. Frames and events that the path does not cover are left out.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from sharpfield.captures.layouts._photos import depth_bounds, fitted, same_camera
+from sharpfield.captures.native.layout import BOUNDS, INTRINSICS, POSES, UNKNOWN
+from sharpfield.captures.paths.pose_layouts import OuterPath
+from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.errors import CaptureError
+from sharpfield.geometry import se3
+from sharpfield.geometry.trajectory import Stamped
+from sharpfield.geometry.two_views import depths_of, find_details, match_pairs, pairs_apart
+from sharpfield.preparation.poses.find import split_of, within
+from sharpfield.preparation.poses.images import sharp_pictures
+from sharpfield.preparation.poses.path import Laid, frames_of, path_through
+from sharpfield.preparation.poses.world import Known
+
+PAIRS = 12
+BOUNDS_PERCENT, BOUNDS_MARGIN = (1.0, 99.0), 1.2
+"""Near and far are these percentiles of the depth of matched details, and a margin."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How a tracked body relates to the camera."""
+
+    offset_us: int = 0
+    """Added to times of the file, to have times of the capture."""
+    body_from_camera: Float64[np.ndarray, "3 4"] | None = None
+    """Where the camera sits; None if the file tracks the camera itself."""
+
+
+@dataclass(frozen=True)
+class Attached:
+    """A capture with poses from elsewhere."""
+
+    capture: Capture
+    kept: Int64[np.ndarray, "m"]
+    """Which frames of the original capture are in it."""
+    covered_us: tuple[int, int] | None
+    """What of the capture's time the poses span; None if cameras stand still."""
+
+
+def attach(
+    capture: Capture, path: OuterPath, mount: Mount, *, bounds: tuple[float, float] | None = None
+) -> Attached:
+    """The capture with the poses of a file.
+
+    Args:
+        capture: Poses it has are not looked at.
+        path: What the file says.
+        mount: How its clock and its body relate to the capture's.
+        bounds: Near and far; by default those of the capture, or where it does not know them, what
+            matched details of the frames show.
+
+    Raises:
+        CaptureError: Times or names do not fit, or bounds are unknown and cannot be found.
+    """
+    poses = _mounted(path.poses, mount)
+    laid = _timed(capture, path, poses, mount) if path.times_us is not None else None
+    if laid is None:
+        frame, poses = _by_frame(capture, path, poses)
+        middle = capture.needed_frames.exposure.middle_us[frame]
+        laid = path_through(capture.needed_frames, frame, middle, poses, capture.clock)
+    streams = {
+        name: None if (held := getattr(capture, name)) is None else within(held, laid.path, laid)
+        for name in ("events", "test_events")
+    }
+    notes = {k: v for k, v in capture.notes.items() if k not in (POSES, BOUNDS)}
+    made = replace(
+        capture,
+        trajectory=laid.path,
+        frames=laid.frames,
+        split=split_of(capture.split, laid.kept, np.zeros(0, np.int64)),
+        depth=None
+        if capture.depth is None
+        else replace(capture.depth, stored=capture.depth.stored[laid.kept]),
+        notes=notes | {"poses_from": f"a file ({path.layout})"},
+        **streams,
+    )
+    made = _with_model(made, path)
+    if bounds is None and capture.notes.get(BOUNDS) == UNKNOWN and path.model is None:
+        bounds = _seen_bounds(made)
+    if bounds is not None:
+        made = replace(made, near=bounds[0], far=bounds[1])
+    return Attached(made, laid.kept, laid.path.known_us(0))
+
+
+def known_at(path: OuterPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> Known:
+    """Poses of the camera at some times of the capture; NaN where the file does not reach.
+
+    Raises:
+        CaptureError: The file has no times.
+    """
+    if path.times_us is None:
+        raise CaptureError("poses without times cannot be looked up by time", got=path.layout)
+    stamps, poses = path.times_us + mount.offset_us, _mounted(path.poses, mount)
+    clock = Clock(int(stamps[0]), max(int(stamps[-1] - stamps[0]), 1))
+    along = Stamped(stamps, poses, clock)
+    unit = torch.from_numpy(clock.unit(times_us))
+    found = along.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).numpy()
+    outside = (times_us < stamps[0]) | (times_us > stamps[-1])
+    return Known(np.where(outside[:, None, None], np.nan, found))
+
+
+def _mounted(poses: Float64[np.ndarray, "p 3 4"], mount: Mount) -> Float64[np.ndarray, "p 3 4"]:
+    if mount.body_from_camera is None:
+        return poses
+    hand = torch.from_numpy(mount.body_from_camera).expand(len(poses), 3, 4)
+    return se3.compose(torch.from_numpy(poses), hand).numpy()
+
+
+def _timed(
+    capture: Capture, path: OuterPath, poses: Float64[np.ndarray, "p 3 4"], mount: Mount
+) -> Laid:
+    """Everything that the path covers; there must be one camera."""
+    assert path.times_us is not None, "the caller looked"
+    stamps = path.times_us + mount.offset_us
+    laid_path = Stamped(stamps, poses, capture.clock)
+    frames = capture.frames
+    if frames is None:
+        _expect_some(
+            capture,
+            stamps,
+            0
+            if capture.events is None
+            else int(np.diff(np.searchsorted(capture.events.t_us, (stamps[0], stamps[-1])))[0]),
+        )
+        return Laid(None, laid_path, np.zeros(0, np.int64), np.zeros(1, np.int64))
+    if len(np.unique(frames.track)) > 1:
+        raise CaptureError(
+            "a file of one path cannot place several cameras",
+            where=capture.name,
+            got=f"{len(np.unique(frames.track))} tracks",
+            do="give a COLMAP model, whose poses belong to images",
+        )
+    inside = (frames.exposure.open_us >= stamps[0]) & (frames.exposure.close_us <= stamps[-1])
+    _expect_some(capture, stamps, int(inside.sum()))
+    kept = np.flatnonzero(inside)
+    track_of = np.zeros(int(frames.track.max()) + 1, np.int64)
+    return Laid(frames_of(frames, kept, np.zeros(len(kept), np.int64)), laid_path, kept, track_of)
+
+
+def _expect_some(capture: Capture, stamps: Int64[np.ndarray, "p"], covered: int) -> None:
+    if covered:
+        return
+    frames, events = capture.frames, capture.events
+    if frames is not None:
+        begin, end = int(frames.exposure.open_us.min()), int(frames.exposure.close_us.max())
+    else:
+        assert events is not None, "a capture has frames or events"
+        begin, end = int(events.t_us[0]), int(events.t_us[-1])
+    raise CaptureError(
+        "the trajectory and the capture were not taken at the same time",
+        where=capture.name,
+        got=f"poses from {stamps[0]} to {stamps[-1]} us, capture from {begin} to {end} us",
+        do=f"give the offset of the clocks; --offset-ms {(begin - int(stamps[0])) / 1000:.0f} makes"
+        " both begin together",
+    )
+
+
+def _by_frame(
+    capture: Capture, path: OuterPath, poses: Float64[np.ndarray, "p 3 4"]
+) -> tuple[Int64[np.ndarray, "n"], Float64[np.ndarray, "n 3 4"]]:
+    """Which frames poses without times belong to: by name, or one for each in order."""
+    frames = capture.needed_frames
+    if path.names is None:
+        if len(poses) != len(frames):
+            raise CaptureError(
+                "poses without times must be as many as the frames",
+                where=capture.name,
+                got=f"{len(poses)} poses, {len(frames)} frames",
+                do="put a times.txt (seconds, a line per pose) beside the file",
+            )
+        return np.lexsort((frames.exposure.middle_us, frames.track)), poses
+    row_of = {name.rsplit("/", 1)[-1]: row for row, name in enumerate(path.names)}
+    found = [(i, row_of[name]) for i, name in enumerate(frames.names) if name in row_of]
+    if not found:
+        raise CaptureError(
+            "no image of the model is a frame of the capture",
+            where=capture.name,
+            got=f"{path.names[0]}, ..., frames {frames.names[0]}, ...",
+            do="name the images like the frames",
+        )
+    frame, row = np.array(found, np.int64).T
+    return frame, poses[row]
+
+
+def _with_model(capture: Capture, path: OuterPath) -> Capture:
+    """Points, depth bounds and, where it is unknown, the lens of a reconstruction."""
+    model = path.model
+    if model is None or not len(model.points):
+        return capture
+    near, far = depth_bounds(model.points, model.poses, model.seen, where=capture.name)
+    camera, notes = capture.camera, dict(capture.notes)
+    if notes.get(INTRINSICS) == UNKNOWN:
+        shared = same_camera(model.cameras, model.names, where=capture.name)
+        camera = fitted(shared, camera.width, camera.height, where=capture.name)
+        notes.pop(INTRINSICS)
+    return replace(capture, camera=camera, points=model.points, near=near, far=far, notes=notes)
+
+
+def _seen_bounds(capture: Capture) -> tuple[float, float]:
+    """Near and far, from details that several frames show."""
+    unknown = CaptureError(
+        "near and far of the scene are unknown, and the frames do not show them",
+        where=capture.name,
+        do="give --near and --far, in units of the trajectory",
+    )
+    if capture.frames is None:
+        raise unknown
+    sharp = sharp_pictures(capture, "auto")
+    time = torch.from_numpy(capture.clock.unit(sharp.time_us))
+    track = torch.from_numpy(capture.frames.track[sharp.frame])
+    poses = capture.trajectory.pose(time, track).detach().double().numpy()
+    pairs = pairs_apart(poses, most=PAIRS)
+    found = []
+    for matches in match_pairs(find_details(sharp.pictures), pairs):
+        depth, sure = depths_of(matches, capture.camera, poses)
+        found += depth[sure].tolist()
+    if not found:
+        raise unknown
+    near, far = np.percentile(found, BOUNDS_PERCENT)
+    return float(near) / BOUNDS_MARGIN, float(far) * BOUNDS_MARGIN

@@ -1,0 +1,126 @@
+"""Whether pictures show enough depth to tell where they were taken from.
+
+Before a plane, moving sideways and turning look nearly alike, and so do a long lens from afar and a
+short one from nearby. A map of such a scene fits its pictures well, and is still wrong. *Relief* is
+what tells them apart: how much of what two pictures far apart both show departs from the plane that
+explains most of it, by more than pictures are exact.
+
+Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 11.9 and 13.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from sharpfield.core.seed import evenly_spread
+from sharpfield.preparation.poses.mapping import Intrinsics, Map
+
+PAIRS = 12
+FAR = 0.75
+"""Of pairs that share points, those are looked at that are farther apart than this share of all."""
+SHARED, VIEWS = 20, 3
+"""Two pictures must share so many points, each seen in so many pictures."""
+TOLERANCE, LEAST_PX = 3.0, 1.0
+"""A point departs from a plane from so many times the map's error on, and from so many px."""
+LEAST_OFF = 0.1
+"""Share of points that must depart from the plane for depth to be told from them."""
+
+
+@dataclass(frozen=True)
+class Relief:
+    """How far the map is from a plane."""
+
+    off_plane: float
+    """Share of what two pictures show that a plane does not explain; the median over pairs."""
+    tolerance_px: float
+    """To within how many px it has to explain it."""
+    thickness: float
+    """Median distance of points from the plane that fits them best, over their median depth."""
+    pairs: int
+    """Of pictures far apart that were looked at."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether a plane explains about as much as the map does."""
+        return self.off_plane < LEAST_OFF
+
+
+def relief(found: Map) -> Relief | None:
+    """How much depth a map shows; None if too few points are shared to say."""
+    pairs = _pairs_far_apart(found)
+    if not pairs:
+        return None
+    error_px = float(np.nanmean(found.error_px))
+    tolerance_px = max(TOLERANCE * error_px, LEAST_PX)
+    shares = [_off_plane(found, one, two, rows, tolerance_px) for one, two, rows in pairs]
+    return Relief(float(np.median(shares)), tolerance_px, _thickness(found), len(pairs))
+
+
+def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | None:
+    """What to know of poses found before something flat, and what to try; None if all is well."""
+    if shown is None or not shown.flat:
+        return None
+    lens = intrinsics != "given"
+    said = (
+        f"the scene is nearly flat: in pictures far apart a plane explains"
+        f" {100 * (1 - shown.off_plane):.0f} % of the points to {shown.tolerance_px:.1f} px, and"
+        f" half of them lie within {100 * shown.thickness:.1f} % of their depth from one plane;"
+        f" camera places{' and the focal length' if lens else ''} may be off by a tenth"
+    )
+    known = "give the focal length (ingest with --calibration, then --intrinsics given); "
+    return said, (
+        f"{known if lens else ''}let training mend poses (train ev-splat --preset refine); record"
+        " with something at another depth in view, and move farther sideways"
+    )
+
+
+def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
+    """Pairs of pictures that share points and are far from each other, and those points."""
+    view, point = found.sightings.T
+    good = found.track_length[point] >= VIEWS
+    shape = len(found.poses), len(found.points)
+    seen = np.zeros(shape, np.float32)
+    seen[view[good], point[good]] = 1
+    shared = np.triu(seen @ seen.T, 1) >= SHARED
+    one, two = np.nonzero(shared)
+    if not len(one):
+        return []
+    centre = found.poses[:, :, 3]
+    apart = np.linalg.norm(centre[one] - centre[two], axis=-1)
+    far = np.flatnonzero(apart >= np.quantile(apart, FAR))
+    some = evenly_spread(far, PAIRS)
+    return [(int(one[i]), int(two[i]), np.flatnonzero(seen[one[i]] * seen[two[i]])) for i in some]
+
+
+def _off_plane(
+    found: Map, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
+) -> float:
+    """Share of points whose places in two pictures the best homography does not relate."""
+    first, second = (_ideal_px(found, i, rows) for i in (one, two))
+    cv2.setRNGSeed(0)
+    _, explained = cv2.findHomography(first, second, cv2.RANSAC, tolerance_px)
+    return 1.0 if explained is None else 1 - float(explained.mean())
+
+
+def _ideal_px(found: Map, view: int, rows: Int64[np.ndarray, "m"]) -> Float64[np.ndarray, "m 2"]:
+    """Where a picture of an ideal lens shows points of the map."""
+    pose = found.poses[view]
+    local = (found.points[rows] - pose[:, 3]) @ pose[:, :3]
+    return found.camera.fx_px * local[:, :2] / local[:, 2:]
+
+
+def _thickness(found: Map) -> float:
+    """Median distance from the plane that half of the points lie closest to, over median depth."""
+    good = found.points[found.track_length >= VIEWS]
+    kept = np.ones(len(good), bool)
+    distance = np.zeros(len(good))
+    for _ in range(5):  # trimmed: a few things before a wall do not tilt it
+        centre = good[kept].mean(0)
+        normal = np.linalg.svd(good[kept] - centre, full_matrices=False)[2][2]
+        distance = np.abs((good - centre) @ normal)
+        kept = distance <= np.median(distance)
+    view, point = found.sightings.T
+    toward = found.points[point] - found.poses[view, :, 3]
+    return float(np.median(distance) / np.median((toward * found.poses[view, :, 2]).sum(-1)))

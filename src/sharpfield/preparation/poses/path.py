@@ -1,0 +1,137 @@
+"""From poses of pictures to where the camera is at any time.
+
+Frames of a camera that moved lie on one path: a cubic through the poses found, SLERP for its
+rotation. It begins where the first shutter opened and ends where the last one closed; these two
+poses are carried on at the speed of the nearest part. Photos, each with a track of its own, stand.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+
+from sharpfield.core.capture import Clock
+from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry import se3
+from sharpfield.geometry.trajectory import Stamped, Still, Tracks
+
+FARTHEST = 1.0
+"""A path is carried on by at most so many times the gap between its last two poses."""
+
+
+def moving_tracks(frames: Frames) -> Int64[np.ndarray, "k"]:
+    """Tracks with several frames at different times: cameras that may have moved."""
+    tracks, count = np.unique(frames.track, return_counts=True)
+    return tracks[count > 1]
+
+
+def carried_on(
+    times_us: Int64[np.ndarray, "p"],
+    poses: Float64[np.ndarray, "p 3 4"],
+    window_us: tuple[int, int],
+) -> tuple[Int64[np.ndarray, "q"], Float64[np.ndarray, "q 3 4"]]:
+    """Poses with one more at either end, so that a window is covered as far as can be trusted.
+
+    Args:
+        times_us: Ascending, at least two.
+        poses: World-from-camera.
+        window_us: What ought to be covered.
+    """
+    begin = max(window_us[0], int(times_us[0] - FARTHEST * (times_us[1] - times_us[0])))
+    end = min(window_us[1], int(times_us[-1] + FARTHEST * (times_us[-1] - times_us[-2])))
+    if begin < times_us[0]:
+        first = _beyond(poses[1], poses[0], (times_us[0] - begin) / (times_us[1] - times_us[0]))
+        times_us, poses = np.insert(times_us, 0, begin), np.insert(poses, 0, first, axis=0)
+    if end > times_us[-1]:
+        last = _beyond(poses[-2], poses[-1], (end - times_us[-1]) / (times_us[-1] - times_us[-2]))
+        times_us, poses = np.append(times_us, end), np.append(poses, last[None], axis=0)
+    return times_us, poses
+
+
+@dataclass(frozen=True)
+class Laid:
+    """A path, and what lies on it."""
+
+    frames: Frames | None
+    """Those that lie on it; their tracks are numbered anew."""
+    path: Stamped | Still | Tracks
+    kept: Int64[np.ndarray, "m"]
+    """Which frames of the capture they are."""
+    track_of: Int64[np.ndarray, "k"]
+    """New number of each old track, -1 for those that were lost."""
+
+
+def path_through(
+    frames: Frames,
+    frame: Int64[np.ndarray, "n"],
+    time_us: Int64[np.ndarray, "n"],
+    poses: Float64[np.ndarray, "n 3 4"],
+    clock: Clock,
+) -> Laid:
+    """The path of all cameras.
+
+    Args:
+        frames: Of the capture.
+        frame: Which frame each pose was found for.
+        time_us: The instant of each.
+        poses: World-from-camera.
+        clock: Of the capture.
+    """
+    moving, standing = list[Stamped](), list[int]()
+    track_of = np.full(int(frames.track.max()) + 1, -1)
+    on_path = np.zeros(len(frames), bool)
+    for one in moving_tracks(frames):
+        own, member = (
+            np.flatnonzero(frames.track[frame] == one),
+            np.flatnonzero(frames.track == one),
+        )
+        times, first = np.unique(time_us[own], return_index=True)
+        if len(times) < 2:
+            continue
+        opens, closes = frames.exposure.open_us[member], frames.exposure.close_us[member]
+        window = int(opens.min()), int(closes.max())
+        times, through = carried_on(times, poses[own[first]], window)
+        on_path[member] = (opens >= times[0]) & (closes <= times[-1])
+        track_of[one] = len(moving)
+        moving.append(Stamped(times, through, clock))
+    for one in np.setdiff1d(frames.track, moving_tracks(frames)):
+        own = np.flatnonzero(frames.track[frame] == one)
+        if len(own):
+            on_path[frame[own[0]]] = True
+            track_of[one] = len(moving) + len(standing)
+            standing.append(int(own[0]))
+    still = poses[np.array(standing, np.int64)]
+    kept = np.flatnonzero(on_path)
+    path = Still(still) if not moving else Tracks(moving, still)
+    if len(moving) == 1 and not standing:
+        path = moving[0]
+    return Laid(frames_of(frames, kept, track_of[frames.track[kept]]), path, kept, track_of)
+
+
+def _beyond(
+    before: Float64[np.ndarray, "3 4"], last: Float64[np.ndarray, "3 4"], share: float
+) -> Float64[np.ndarray, "3 4"]:
+    """The last pose, moved on by a share of the motion that led to it."""
+    one, two = torch.from_numpy(before), torch.from_numpy(last)
+    turn = se3.rotation_log(two[:, :3] @ one[:, :3].mT)
+    rotation = se3.rotation_exp(share * turn) @ two[:, :3]
+    place = two[:, 3:] + share * (two[:, 3:] - one[:, 3:])
+    return torch.cat([rotation, place], -1).numpy()
+
+
+def frames_of(
+    frames: Frames, chosen: Int64[np.ndarray, "m"], track: Int64[np.ndarray, "m"]
+) -> Frames:
+    """Some of the frames, on new tracks; depth is left out, being in units of another world."""
+    return replace(
+        frames,
+        images=frames.images[chosen],
+        exposure=Exposure(frames.exposure.open_us[chosen], frames.exposure.close_us[chosen]),
+        track=track,
+        names=tuple(frames.names[i] for i in chosen),
+        truth=None if frames.truth is None else frames.truth[chosen],
+        truth_known=None if frames.truth_known is None else frames.truth_known[chosen],
+        depth=None,
+        flow=None if frames.flow is None else frames.flow[chosen],
+    )

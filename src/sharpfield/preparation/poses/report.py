@@ -1,0 +1,298 @@
+"""What finding poses leaves behind in numbers and words: which pictures, how well, and why not.
+
+The page that `sharpfield poses` leaves beside the capture: pictures, points, path, numbers.
+"""
+
+import html
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.files import replacing
+from sharpfield.core.seed import evenly_spread
+from sharpfield.preparation.poses.find import PosesFound
+from sharpfield.preparation.poses.find_checks import advice
+from sharpfield.report import page
+from sharpfield.report.figures import trajectory_figure
+from sharpfield.report.page import Look, Picture, View, section
+from sharpfield.report.tables import Table, as_html
+
+
+def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
+    """Plain values, ready for JSON.
+
+    Lengths are in units of the new world. Errors are distances, in px, between where points were
+    seen and where they project.
+    """
+    made, sharp, mapped = found.capture, found.sharp, found.map
+    there = mapped.registered
+    camera = made.camera
+    known = None if sharp.found is None else sharp.found.thresholds
+    names = original.needed_frames.names
+    return {
+        "capture": original.name,
+        "pictures_from": sharp.source,
+        "thresholds": None
+        if known is None
+        else {"negative": known.negative, "positive": known.positive},
+        "pictures": len(sharp),
+        "registered": int(there.sum()),
+        "frames": {
+            "before": len(original.needed_frames),
+            "after": len(made.needed_frames),
+            "train": len(made.split.train),
+            "test": len(made.split.test),
+            "left_out": [names[i] for i in range(len(names)) if i not in found.kept],
+        },
+        "error_px": _rounded(float(np.nanmean(mapped.error_px)), 3),
+        "points": {
+            "map": len(mapped.points),
+            "kept": 0 if made.points is None else len(made.points),
+            "mean_track_length": _rounded(mapped.track_length.mean(), 2),
+            "median_error_px": _rounded(np.median(mapped.point_error_px), 3),
+        },
+        "camera": {
+            "from": found.intrinsics,
+            "lens": camera.lens,
+            "focal_px": [_rounded(camera.fx_px, 2), _rounded(camera.fy_px, 2)],
+            "centre_px": [_rounded(camera.cx_px, 2), _rounded(camera.cy_px, 2)],
+            "distortion": list(camera.distortion),
+        },
+        "bounds": {"near": _rounded(made.near, 4), "far": _rounded(made.far, 4)},
+        "off_known_positions": found.off_known,
+        "relief": _relief(found),
+        "each": _each(original, found),
+    }
+
+
+def as_text(about: dict[str, Any]) -> str:
+    """The summary in lines for a terminal; every picture that failed says why and what to do."""
+    frames, points, camera = about["frames"], about["points"], about["camera"]
+    lines = [
+        f"{about['registered']} of {about['pictures']} pictures have a pose"
+        f" (taken from {about['pictures_from']}), {about['error_px']} px off on average",
+        f"{points['map']} points, each seen in {points['mean_track_length']} pictures",
+        f"focal length {camera['focal_px'][0]} px ({camera['from']}), depth"
+        f" {about['bounds']['near']} to {about['bounds']['far']}",
+        f"{frames['after']} of {frames['before']} frames are in the new capture:"
+        f" {frames['train']} to train, {frames['test']} held out",
+    ]
+    if about["off_known_positions"] is not None:
+        lines.append(f"camera centres are {about['off_known_positions']:.4g} from the known ones")
+    if about["relief"] is not None and about["relief"]["flat"]:
+        lines.append(f"warning: {about['relief']['why']}")
+        lines.append(f"  do     {about['relief']['do']}")
+    failed = [one for one in about["each"] if not one["registered"]]
+    for one in failed:
+        lines.append(f"no pose: {one['frame']} at {one['time_us']} us: {one['why']}")
+        lines.append(f"  do     {one['do']}")
+    return "\n".join(lines)
+
+
+def _relief(found: PosesFound) -> dict[str, Any] | None:
+    shown = found.relief
+    if shown is None:
+        return None
+    told = advice(shown, found.intrinsics)
+    return {
+        "flat": shown.flat,
+        "off_plane": _rounded(shown.off_plane, 4),
+        "tolerance_px": _rounded(shown.tolerance_px, 3),
+        "thickness": _rounded(shown.thickness, 4),
+        "pairs": shown.pairs,
+    } | ({} if told is None else {"why": told[0], "do": told[1]})
+
+
+def _each(original: Capture, found: PosesFound) -> list[dict[str, Any]]:
+    sharp, mapped, seen = found.sharp, found.map, found.seen
+    points = np.bincount(mapped.sightings[:, 0], minlength=len(sharp))
+    failures = {failure.picture: failure for failure in found.failures}
+    rows = []
+    for i in range(len(sharp)):
+        row: dict[str, Any] = {
+            "frame": original.needed_frames.names[sharp.frame[i]],
+            "time_us": int(sharp.time_us[i]),
+            "registered": bool(mapped.registered[i]),
+            "features": int(seen.features[i]),
+            "matches": int(seen.matches[i]),
+            "partners": int(seen.partners[i]),
+            "points": int(points[i]),
+            "error_px": _rounded(mapped.error_px[i], 3) if mapped.registered[i] else None,
+        }
+        if i in failures:
+            row |= {"why": failures[i].why, "do": failures[i].do}
+        rows.append(row)
+    return rows
+
+
+def _rounded(value: float, digits: int) -> float:
+    return round(float(value), digits)
+
+
+LOOK = Look(640, 82)
+SHOWN = 6
+"""Pictures shown, beside all that failed up to as many."""
+GREEN, AMBER = (40, 200, 90), (245, 160, 40)
+ZOOM = 2
+"""Small pictures are enlarged, so that marks on them can be told apart."""
+SMALL = 480
+
+
+def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str, Any]) -> None:
+    """Write the page.
+
+    Args:
+        path: Where.
+        original: The capture before.
+        found: What was found.
+        about: Its summary.
+    """
+    body = "\n".join(
+        part
+        for part in (
+            _header(about),
+            _flat(about),
+            _failures(about),
+            _pictures(original, found),
+            section(
+                "The path",
+                page.drawing(
+                    trajectory_figure(found.capture),
+                    "Where the camera was: thick where the shutter was open, ticks where it"
+                    " looked; orange to learn from, blue held out.",
+                ),
+            ),
+            _table(about),
+        )
+        if part
+    )
+    with replacing(path) as temporary:
+        temporary.write_text(page.page(f"{about['capture']}: poses", body), encoding="utf-8")
+
+
+def _header(about: dict[str, Any]) -> str:
+    points, camera = about["points"], about["camera"]
+    values = [
+        (f"{about['registered']} of {about['pictures']}", "pictures with a pose", "registered"),
+        (f"{about['error_px']:.2f} px", "reprojection error", "mean over pictures"),
+        (
+            f"{points['map']:,}",
+            "points",
+            f"each seen in {points['mean_track_length']:.1f} pictures",
+        ),
+        (f"{camera['focal_px'][0]:.1f} px", "focal length", str(camera["from"])),
+        (
+            f"{about['bounds']['near']:.3g} … {about['bounds']['far']:.3g}",
+            "near and far",
+            "median depth of the points is 1"
+            if about["off_known_positions"] is None
+            else "in units of the known positions",
+        ),
+    ]
+    told = {
+        "edi": "frames deblurred with their events",
+        "frames": "frames as they are",
+        "sharpest": "the sharpest of each three frames",
+    }[about["pictures_from"]]
+    return (
+        f'<header>\n<p class="eyebrow">sharpfield poses</p>\n<h1>{html.escape(about["capture"])}'
+        f'</h1>\n<p class="subtitle">From {told}</p>\n{page.cards(values)}</header>'
+    )
+
+
+def _flat(about: dict[str, Any]) -> str:
+    relief = about["relief"]
+    if relief is None or not relief["flat"]:
+        return ""
+    rows = ((relief["why"], relief["do"]),)
+    return section("Too flat", as_html(Table(("what is unsure", "what to try"), rows)))
+
+
+def _failures(about: dict[str, Any]) -> str:
+    rows = tuple(
+        (one["frame"], str(one["features"]), str(one["matches"]), one["why"], one["do"])
+        for one in about["each"]
+        if not one["registered"]
+    )
+    if not rows:
+        return ""
+    table = Table(("picture", "features", "matches", "why it has no pose", "what to try"), rows)
+    return section("Without a pose", as_html(table))
+
+
+def _pictures(original: Capture, found: PosesFound) -> str:
+    lost = np.flatnonzero(~found.map.registered)[:SHOWN]
+    good = np.flatnonzero(found.map.registered)
+    spread = evenly_spread(good, SHOWN)
+    views = [_view(original, found, int(i)) for i in [*lost, *spread]]
+    return section(
+        "What was seen",
+        page.comparison(views, LOOK, left="recorded", right="used"),
+        intro="Recorded frames, and the pictures poses were found from with the points seen in"
+        " them: green within a pixel of where they project, amber farther.",
+    )
+
+
+def _view(original: Capture, found: PosesFound, picture: int) -> View:
+    frame = int(found.sharp.frame[picture])
+    name = original.needed_frames.names[frame]
+    held = original.needed_frames
+    recorded = np.rint(np.asarray(held.images[frame], np.float64) * (255 / held.white))
+    said = (
+        f"{name}, used: {found.map.error_px[picture]:.2f} px"
+        if found.map.registered[picture]
+        else f"{name}: no pose"
+    )
+    return View(
+        f"{name} ({picture})",
+        (
+            Picture("recorded", _large(recorded.astype(np.uint8)), name, f"{name} as recorded"),
+            Picture("used", _marked(found, picture), said, f"{name} with the points seen in it"),
+        ),
+    )
+
+
+def _marked(found: PosesFound, picture: int) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with the points of the map projected into it."""
+    shown = np.ascontiguousarray(_large(found.sharp.pictures[picture]))
+    if not found.map.registered[picture]:
+        return shown
+    rows = found.map.sightings[found.map.sightings[:, 0] == picture, 1]
+    pose = found.map.poses[picture]
+    local = (found.map.points[rows] - pose[:, 3]) @ pose[:, :3]
+    xy = found.map.camera.project(torch.from_numpy(local)).numpy() * (
+        shown.shape[1] / found.map.camera.width
+    )
+    for (x, y), error in zip(xy, found.map.point_error_px[rows], strict=True):
+        colour = GREEN if error < 1 else AMBER
+        cv2.circle(shown, (round(x), round(y)), 3, colour, 1, cv2.LINE_AA)
+    return shown
+
+
+def _large(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """In three channels, and large enough to look at."""
+    colour = np.repeat(picture, 3, -1) if picture.shape[-1] == 1 else picture
+    if max(colour.shape) >= SMALL:
+        return colour
+    return cv2.resize(colour, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC)
+
+
+def _table(about: dict[str, Any]) -> str:
+    rows = tuple(
+        (
+            one["frame"],
+            f"{one['time_us'] / 1000:.1f}",
+            str(one["features"]),
+            str(one["partners"]),
+            str(one["points"]),
+            "–" if one["error_px"] is None else f"{one['error_px']:.2f}",
+        )
+        for one in about["each"]
+    )
+    table = Table(("frame", "time, ms", "features", "partners", "points", "error, px"), rows)
+    return section("Each picture", page.folded_if_long("All pictures", as_html(table), len(rows)))

@@ -1,0 +1,208 @@
+"""Which frames of a video are sharp: scores, weights, and a picture of the ranking.
+
+Blur a folder of sharp pictures, each by one random motion kernel, and say what was done.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float64, UInt8
+from matplotlib.figure import Figure
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.files import replacing, replacing_folder, write_json
+from sharpfield.core.seed import numpy_generator
+from sharpfield.metrics.quality import Means, Quality, Way, event_quality, quality
+from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
+from sharpfield.storage.images import list_images, read_image, write_image
+
+SHOWN = 5
+"""Frames at each end of the ranking that the picture shows."""
+BLUR_NOTE = "blur_px"
+"""Note of a simulated capture: the true blur of each frame."""
+
+
+@dataclass(frozen=True)
+class QualityOptions:
+    """How frames are judged."""
+
+    source: Literal["auto", "pictures", "events"] = "auto"
+    """What tells: auto takes events where the capture has them."""
+    overlap: Means = "auto"
+    """What two pictures both show: by depth (auto, where there is some) or optical flow."""
+    way: Way = "reconciled"
+    """Compare with several neighbours; or as published, with the next only."""
+    every_frame: bool = False
+    """Judge held-out frames, too."""
+
+
+def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
+    """Scores and weights, and what told: "events", "depth" or "flow".
+
+    Raises:
+        OptionError: There are fewer than two frames to compare.
+        CaptureError: See `metrics.quality`.
+    """
+    every = np.arange(len(capture.needed_frames))
+    frames = every if options.every_frame else capture.split.train
+    if len(frames) < 2:
+        raise OptionError(
+            "quality compares frames, and there are fewer than two",
+            where=capture.name,
+            do="judge held-out frames, too: --every-frame",
+        )
+    single = capture.events is not None and capture.events.track is None
+    if options.source == "events" or (options.source == "auto" and single):
+        return event_quality(capture, frames=frames), "events"
+    by_depth = capture.depth is not None and options.overlap != "flow"
+    found = quality(capture, frames=frames, overlap=options.overlap, way=options.way)
+    return found, "depth" if by_depth else "flow"
+
+
+def as_table(capture: Capture, found: Quality, told_by: str) -> dict[str, Any]:
+    """Numbers ready for JSON; where the true blur is known, how well scores rank it."""
+    names = capture.needed_frames.names
+    true = _true_blur(capture, found)
+    rows: list[dict[str, Any]] = []
+    for k, frame in enumerate(found.frames.tolist()):
+        row = {
+            "name": names[frame],
+            "score": float(found.scores[k]),
+            "weight": float(found.weights[k]),
+        }
+        rows.append(row if true is None else row | {"true_blur_px": float(true[k])})
+    about: dict[str, Any] = {"capture": capture.name, "told_by": told_by, "frames": rows}
+    if true is not None:
+        about["rank_correlation"] = rank_correlation(found.scores, -true)
+    return about
+
+
+def quality_to(capture: Capture, found: Quality, told_by: str, out: Path) -> None:
+    """Write `quality.json`, `ranking.png` and `weights.npy` (a weight for each judged frame)."""
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "quality.json", as_table(capture, found, told_by))
+    with replacing(out / "weights.npy") as temporary:
+        np.save(temporary, found.weights)
+    with replacing(out / "ranking.png") as temporary:
+        ranking(capture, found, told_by).savefig(temporary, dpi=110)
+
+
+def rank_correlation(a: Float64[np.ndarray, "m"], b: Float64[np.ndarray, "m"]) -> float:
+    """Spearman's correlation: that of the ranks, where equal values share the mean of theirs."""
+    one, other = _ranks(a), _ranks(b)
+    if one.std() == 0 or other.std() == 0:
+        return 0.0
+    return float(np.corrcoef(one, other)[0, 1])
+
+
+def ranking(capture: Capture, found: Quality, told_by: str) -> Figure:
+    """Scores and weights along the video, and the blurriest and sharpest frames."""
+    order = np.argsort(found.scores, kind="stable")
+    shown = min(SHOWN, max(len(order) // 2, 1))
+    with matplotlib.rc_context({"font.size": 8}):
+        figure = Figure(figsize=(2.3 * shown, 6.4), layout="constrained")
+        grid = figure.add_gridspec(4, shown)
+        along = figure.add_subplot(grid[0, :])
+        along.semilogy(found.frames, found.scores / found.scores.mean(), color="0.4", lw=1)
+        along.set_ylabel(f"score ({told_by})")
+        true = _true_blur(capture, found)
+        if true is not None:
+            truth = along.twinx()
+            truth.plot(found.frames, true, color="tab:red", lw=1)
+            truth.set_ylabel("true blur, px", color="tab:red")
+        weights = figure.add_subplot(grid[1, :], sharex=along)
+        weights.bar(found.frames, found.weights, width=1.0, color="tab:blue")
+        weights.axhline(1.0, color="0.6", lw=0.8)
+        weights.set(ylabel="weight", xlabel="frame")
+        for row, chosen, word in ((2, order[:shown], "blurriest"), (3, order[-shown:], "sharpest")):
+            for column, k in enumerate(chosen if row == 2 else chosen[::-1]):
+                panel = figure.add_subplot(grid[row, column])
+                frame = int(found.frames[k])
+                panel.imshow(_shown(capture, frame), cmap="gray", vmin=0, vmax=255)
+                panel.set_axis_off()
+                name = capture.needed_frames.names[frame]
+                panel.set_title(f"{word if column == 0 else ''} {name}  {found.weights[k]:.2f}")
+    return figure
+
+
+def _shown(capture: Capture, frame: int) -> UInt8[np.ndarray, "h w *c"]:
+    image = np.asarray(capture.needed_frames.images[frame])
+    if image.dtype != np.uint8:
+        image = np.rint(image * (255.0 / capture.needed_frames.white)).astype(np.uint8)
+    return image if image.shape[-1] == 3 else image[..., 0]
+
+
+def _true_blur(capture: Capture, found: Quality) -> Float64[np.ndarray, "m"] | None:
+    true = capture.notes.get(BLUR_NOTE)
+    if not isinstance(true, np.ndarray) or len(true) != len(capture.needed_frames):
+        return None
+    return true[found.frames].astype(np.float64)
+
+
+def _ranks(values: Float64[np.ndarray, "m"]) -> Float64[np.ndarray, "m"]:
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - 0.5 * (count + 1))[place]
+
+
+ABOUT = "blur.json"
+
+
+def blur_pictures(
+    folder: Path, out: Path, *, ranges: KernelRange = PUBLISHED, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Write blurred copies of the same names and sizes, and `blur.json`; all of it or nothing.
+
+    Pictures that stay sharp are copied byte for byte. What is drawn for a picture depends on the
+    seed and its place in the order of names.
+
+    Args:
+        folder: PNG or JPEG pictures.
+        out: A new or empty folder, or an earlier result.
+        ranges: What kernels are drawn from.
+        seed: Another seed, other kernels.
+
+    Returns:
+        A row for each picture: its name, whether it was blurred, k, phi, and how far it reaches.
+
+    Raises:
+        CaptureError: There are no pictures, one cannot be read, or `out` holds something else.
+    """
+    paths = list_images(folder)
+    if not paths:
+        raise CaptureError("there are no pictures", where=folder, do="give PNG or JPEG files")
+    if out.exists() and not (out.is_dir() and (is_result(out) or not any(out.iterdir()))):
+        raise CaptureError(
+            "will not replace what is not a folder of blurred pictures",
+            where=out,
+            do="choose another place, or empty it",
+        )
+    rows: list[dict[str, Any]] = []
+    with replacing_folder(out) as fresh:
+        for i, path in enumerate(paths):
+            drawn = drawn_blur(ranges, numpy_generator(seed, i, "kernel"))
+            if drawn is None:
+                (fresh / path.name).write_bytes(path.read_bytes())
+                rows.append({"name": path.name, "blurred": False})
+                continue
+            write_image(fresh / path.name, blurred(read_image(path), drawn.kernel))
+            about = {"k": drawn.k, "phi": drawn.phi, "length_px": drawn.length_px}
+            rows.append({"name": path.name, "blurred": True, **about})
+        written = {
+            "seed": seed,
+            "k": list(ranges.k),
+            "phi": list(ranges.phi),
+            "probability": ranges.probability,
+            "pictures": rows,
+        }
+        (fresh / ABOUT).write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    return rows
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder was written by `blur_pictures`."""
+    return (folder / ABOUT).is_file()

@@ -1,0 +1,83 @@
+"""Recipes on moving Gaussians: a moving scene from a rig of cameras, in minutes.
+
+What moves are Gaussians that come, follow a curve and go; what stands still are others. Frames,
+sharp or blurred, and events of any number of cameras say how: several cameras look at the same
+moments.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, TypeVar
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.paper import Paper
+from sharpfield.recipes.splats.dynamic_model import DynamicModel
+from sharpfield.recipes.splats.dynamic_scene import DynamicOptions
+from sharpfield.recipes.splats.learned_calibration import UnknownOptions
+from sharpfield.sampling.rig_views import RigLookOptions
+
+R = TypeVar("R", bound="DynamicSplat")
+
+LI = Paper(
+    key="li2024spacetime",
+    title="Spacetime Gaussian Feature Splatting for Real-Time Dynamic View Synthesis",
+    bibtex="""@inproceedings{li2024spacetime,
+  title     = {Spacetime {Gaussian} Feature Splatting for Real-Time Dynamic View Synthesis},
+  author    = {Li, Zhan and Chen, Zhang and Li, Zhong and Xu, Yi},
+  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
+  year      = {2024}
+}""",
+    departures=(
+        "Gaussians have one colour each: there are no features that a network turns into colours.",
+        "They are opaque for most of their time and then fade fast, exp(-d^4/2) for exp(-d^2/2).",
+        "What stands still are Gaussians of their own, before an even background.",
+        "Moving ones start in the hull of each moment, not at points of structure from motion.",
+        "The loss is the mean absolute difference alone, without structural similarity.",
+    ),
+)
+
+OURS = Paper(
+    key="sharpfield-ev-dynamic-splat",
+    title="Moving Gaussians from frames and events of many cameras (sharpfield)",
+    bibtex="""@software{sharpfield,
+  title = {sharpfield: sharp radiance fields from blurry frames and events},
+  note  = {Recipe ev-dynamic-splat. It builds on spacetime Gaussians (Li et al.,
+           CVPR 2024), on the event double integral (Pan et al., CVPR 2019) and on EvDNeRF
+           (Bhattacharya et al., WACV 2024)}
+}""",
+)
+
+
+@dataclass(frozen=True)
+class DynamicSplat:
+    """Moving Gaussians from frames alone. What events must beat."""
+
+    paper: ClassVar[Paper] = LI
+
+    steps: int = 10_000
+    """Length of the schedule."""
+    gaussians: DynamicOptions = field(default_factory=DynamicOptions)
+    looks: RigLookOptions = field(default_factory=lambda: RigLookOptions(sharp=0.0, windows=0.0))
+    unknowns: UnknownOptions = field(default_factory=UnknownOptions)
+
+    def lasting(self: R, steps: int) -> R:
+        """The same recipe with its whole schedule stretched or shrunk; it is given in parts."""
+        return replace(self, steps=steps)
+
+    def build(self, capture: Capture, seed: int) -> DynamicModel:
+        """On the frames alone, whatever else there is."""
+        assert capture.needed_frames is not None
+        return DynamicModel(self, capture.without(events=True), seed)
+
+
+@dataclass(frozen=True)
+class EvDynamicSplat(DynamicSplat):
+    """Moving Gaussians from events, and from frames, sharp or blurred, if there are any."""
+
+    paper: ClassVar[Paper] = OURS
+
+    looks: RigLookOptions = field(default_factory=RigLookOptions)
+
+    def build(self, capture: Capture, seed: int) -> DynamicModel:
+        """On events and whatever frames there are."""
+        assert capture.needed_events is not None
+        return DynamicModel(self, capture, seed)

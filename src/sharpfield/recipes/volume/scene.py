@@ -1,0 +1,185 @@
+"""The sharp scene of the volumetric recipes: a capture in its own space, a field, a renderer."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Capture
+from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.schedule import Group, Schedule
+from sharpfield.core.seed import generator
+from sharpfield.fields.mlp import MLPField
+from sharpfield.fields.plane_grid import HeadSize, PlaneField
+from sharpfield.fields.voxels import VoxelGrid
+from sharpfield.geometry.normalise import normalised, reference_poses
+from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
+from sharpfield.losses.regularizers import smoothness
+from sharpfield.ops.total_variation import total_variation
+from sharpfield.rendering.coarse_to_fine import CoarseToFine
+from sharpfield.rendering.gather import Compositing
+from sharpfield.rendering.march import EvenSteps
+
+MOST_CELLS = 4_000_000
+"""Cells of a dense grid that sizes itself; each costs 64 bytes with its gradient and moments."""
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """The field, and how rays sample it. Defaults: Ev-DeblurNeRF (CVPR 2024)."""
+
+    kind: Literal["planes", "mlp", "voxels"] = "planes"
+    """Factored feature volumes with small networks, NeRF's large networks alone, or a dense grid of
+    density and colour without any network."""
+    voxels: tuple[int, int] = (16_777_248, 134_217_984)
+    """Resolution of the coarse and the fine volume: about 256^3 and 512^3. A dense grid has the
+    second; 0 gives it about a cell for each pixel and step."""
+    channels: tuple[int, int, int] = (64, 16, 16)
+    """Features of the xy, xz and yz planes."""
+    coarse: tuple[int, int, int] = (64, 15, 64)
+    """Coarse head: hidden width, features, width of the colour layers."""
+    fine: tuple[int, int, int] = (256, 128, 256)
+    """Fine head."""
+    octaves: tuple[int, int] = (10, 4)
+    """Frequencies in the encoding of position and of direction."""
+    samples: tuple[int, int] = (64, 64)
+    """Coarse points on a ray, and fine points added to them. A dense grid takes as many steps as
+    both together."""
+    noise: float = 1.0
+    """Standard deviation of the noise on raw density while training."""
+    density: Literal["relu", "softplus"] = "relu"
+    """From raw density to density."""
+    space: Literal["auto", "ndc", "metric"] = "auto"
+    """Normalised device coordinates, or plain distance; auto takes the first if all cameras look
+    roughly the same way."""
+    background: float = 0.0
+    """Light from behind a metric space, 0 black to 1 white."""
+    clear_before: float = 0.0
+    """In evaluation, nothing is seen up to this ray parameter (0...1); hides floaters."""
+    precision: Literal["float32", "bfloat16", "auto"] = "float32"
+    """What the heads compute in; auto takes bfloat16 where the processor has it."""
+
+
+def soft(raw: torch.Tensor) -> torch.Tensor:
+    """A smooth density that starts thin, so that rays see through an untrained scene."""
+    return nn.functional.softplus(raw - 1)
+
+
+ACTIVATIONS = {"relu": torch.relu, "softplus": soft}
+
+
+class Volume(nn.Module):
+    """A sharp scene and the capture it explains, in the same normalised space.
+
+    Args:
+        options: Sizes and sampling.
+        capture: As read.
+        seed: Of the run.
+    """
+
+    def __init__(self, options: VolumeOptions, capture: Capture, seed: int) -> None:
+        super().__init__()
+        self.options, self.seed = options, seed
+        self.capture, self.change = normalised(capture)
+        self.path = self.capture.trajectory
+        poses = reference_poses(self.capture)
+        self.space = _space(options, self.capture, poses)
+        box = self.space.box(_seen_from(self.capture, poses))
+        self.field = _field(options, box, self.capture.camera, seed)
+        if isinstance(self.field, VoxelGrid):
+            self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
+            self.view = replace(self.train_view, clear_before=options.clear_before)
+            return
+        how = Compositing(
+            activation=ACTIVATIONS[options.density],
+            opaque_end=isinstance(self.space, Frustum),
+            background=options.background,
+        )
+        clear = replace(how, clear_before=options.clear_before)
+        self.train_view = CoarseToFine(self.field, self.space, options.samples, options.noise, how)
+        self.view = CoarseToFine(self.field, self.space, options.samples, 0.0, clear)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    @property
+    def feature_width(self) -> int:
+        """Width of the features along rays; 0 if there are none."""
+        widths = {"planes": self.options.fine[1], "mlp": 256, "voxels": 0}
+        return widths[self.options.kind]
+
+    def sharp(self, rays: Rays, step: int, stream: str, *, samples: bool = False) -> Radiance:
+        """Light along rays while training: jittered and noisy, by seed, step and stream."""
+        made = generator(self.seed, step, stream, self.device)
+        return self.train_view(rays, made, samples=samples)
+
+    def smoothness(self) -> Tensor:
+        """Total variation of the grids; zero without any."""
+        if isinstance(self.field, VoxelGrid):
+            # Plenoxels (CVPR 2022) takes the root of the squares instead, at sampled cells.
+            return total_variation(self.field.cells()[0])
+        planes, lines = self.field.planes(), self.field.lines()
+        return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
+
+    def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
+        """Parameters of the networks and of the grids."""
+        if isinstance(self.field, VoxelGrid):
+            grids: tuple[nn.Parameter, ...] = tuple(self.field.cells())
+        else:
+            grids = (*self.field.planes(), *self.field.lines())
+        known = {id(grid) for grid in grids}
+        networks = [p for p in self.field.parameters() if id(p) not in known]
+        groups = [Group("networks", tuple(networks), rate), Group("grids", grids, grids_rate)]
+        return [group for group in groups if group.parameters]
+
+
+def stages(light: Radiance) -> list[Radiance]:
+    """The light as the fine stage sees it, and as the coarse one does where there are two."""
+    return [light] if light.coarse is None else [light, light.coarse]
+
+
+def _field(
+    options: VolumeOptions, box: Float[Tensor, "2 3"], camera: Camera, seed: int
+) -> PlaneField | MLPField | VoxelGrid:
+    if options.kind == "voxels":
+        pixels = camera.width * camera.height
+        return VoxelGrid(box, options.voxels[1] or min(pixels * sum(options.samples), MOST_CELLS))
+    made = generator(seed, 0, "field")
+    if options.kind == "mlp":
+        return MLPField(generator=made)
+    return PlaneField(
+        box,
+        options.voxels,
+        generator=made,
+        heads=(HeadSize(*options.coarse), HeadSize(*options.fine)),
+        channels=options.channels,
+        octaves=options.octaves,
+        precision=_precision(options.precision),
+    )
+
+
+def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space:
+    in_frustum = options.space == "ndc" or (options.space == "auto" and forward_facing(poses))
+    if in_frustum:
+        return Frustum(capture.camera)
+    return Metric(capture.camera, capture.near, capture.far)
+
+
+def _seen_from(capture: Capture, poses: Float[np.ndarray, "n 3 4"]) -> Float[Tensor, "m 3 4"]:
+    """The poses that the scene box holds the views of: the frames', or those given without any."""
+    if capture.frames is None:
+        return torch.as_tensor(poses).float()
+    return capture.frame_pose(np.arange(len(capture.frames)))
+
+
+def _precision(name: str) -> torch.dtype:
+    if name == "auto":
+        fast = torch.cuda.is_available() or torch.cpu._is_avx512_bf16_supported()  # pyright: ignore
+        name = "bfloat16" if fast else "float32"
+    return getattr(torch, name)

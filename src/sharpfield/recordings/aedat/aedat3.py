@@ -1,0 +1,265 @@
+"""AEDAT3.1, the files of iniVation's cAER: events, frames with their exposures, triggers.
+
+A header of `#` lines up to `#!END-HEADER`, then packets of one kind of event each, little-endian:
+28 bytes of head, and events of equal size. Times of 31 bits are continued by a counter in the
+head. Every camera is a *source* with a number and a name, which tells the size of its sensor.
+
+    special     type 0, 8 bytes: valid · what, 7 bits · time         triggers are among them
+    polarity    type 1, 8 bytes: valid · polarity · y, 15 bits · x, 15 bits · time
+    frame       type 2: valid · channels, 3 bits · four times · size · position · 16-bit pixels
+
+Motion readings and what other modules of cAER add are passed over. (0, 0) is the upper left.
+Source: https://docs.inivation.com, "AEDAT 3.1"; the event types of libcaer.
+"""
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.bytes import head
+from sharpfield.recordings.chunks import Piece, joined, known_size
+from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
+
+FIRST_LINE, LAST_LINE = b"#!AER-DAT3.1\r\n", b"#!END-HEADER\r\n"
+LONGEST_HEADER = 2**20
+
+SIZES = {
+    "DVS128": (128, 128),
+    "EDVS": (128, 128),
+    "DAVIS128": (128, 128),
+    "DAVIS208": (208, 192),
+    "DAVIS240": (240, 180),
+    "DAVIS346": (346, 260),
+    "DAVIS640": (640, 480),
+    "DAVISHET640": (640, 480),
+    "DVXPLORER": (640, 480),
+}
+"""By what a source's name begins with."""
+
+SPECIAL, POLARITY, FRAME = 0, 1, 2
+
+HEAD = struct.Struct("<hhiiiiii")
+FRAME_HEAD = struct.Struct("<Iiiiiiiii")
+
+LARGEST = 2**28
+"""Bytes of a packet; no sound one has more."""
+
+EDGES = {
+    2: (1, 0), 3: (-1, 0), 4: (1, 0),
+    6: (1, 1), 7: (-1, 1), 8: (1, 1),
+    9: (1, 2), 10: (-1, 2), 11: (1, 2),
+    12: (1, 3), 13: (-1, 3),
+}  # fmt: skip
+"""Edge and channel by type of special event; 3 is the camera's generator."""
+
+
+class Head(NamedTuple):
+    """What a packet says of itself."""
+
+    kind: int
+    source: int
+    size: int
+    """Bytes of an event."""
+    time_at: int
+    """Where in an event its time is."""
+    overflow: int
+    """How often times have wrapped."""
+    capacity: int
+    count: int
+    valid: int
+
+
+class Packet(NamedTuple):
+    """Events of one kind."""
+
+    size: int
+    """Bytes of an event."""
+    since_us: int
+    """To be added to their times."""
+    count: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where packets begin, and whose are read."""
+
+    path: Path
+    begin: int
+    source: int
+    trouble: Trouble = field(default_factory=Trouble)
+
+
+def open_aedat3(
+    path: Path, *, size: tuple[int, int] | None = None, topic: str | None = None
+) -> Recording:
+    """Open a file of cAER.
+
+    Args:
+        path: Of the file.
+        size: Of the sensor, where the camera's name does not tell.
+        topic: Number of one of several sources.
+
+    Raises:
+        CaptureError: It is no AEDAT3.1, or has several sources and none was chosen.
+    """
+    start = head(path, LONGEST_HEADER)
+    end = start.find(LAST_LINE)
+    if not start.startswith(FIRST_LINE) or end < 0:
+        raise CaptureError(
+            "the file is no AEDAT3.1",
+            where=path,
+            got=start[:16],
+            do="convert AEDAT3.0 with iniVation's DV",
+        )
+    named = re.findall(r"^#Source (\d{1,4}): *([^\r\n]*)", start[:end].decode("latin-1"), re.M)
+    sources = {int(number): name.strip() for number, name in named}
+    source = _chosen(sources, topic, path)
+    size = known_size(_size(sources[source]), size, path)
+    layout = Layout(path, end + len(LAST_LINE), source)
+    return Recording(
+        path,
+        "AEDAT3.1",
+        size,
+        events=partial(_events, layout, size),
+        frames=partial(_frames, layout) if sources[source].upper().startswith("DAVIS") else None,
+        triggers=partial(_triggers, layout),
+        trouble=layout.trouble,
+        notes={"camera": sources[source]},
+    )
+
+
+def _chosen(sources: dict[int, str], topic: str | None, path: Path) -> int:
+    asked = int(topic) if topic is not None and re.fullmatch("[0-9]{1,4}", topic) else None
+    if asked in sources:
+        return asked
+    if topic is None and len(sources) == 1:
+        return next(iter(sources))
+    raise CaptureError(
+        "the file has no source that was chosen" if sources else "the file names no source",
+        where=path,
+        got=", ".join(f"{number} {name}" for number, name in sources.items()),
+        do="give the number of a source as topic" if sources else "copy it again",
+    )
+
+
+def _size(name: str) -> tuple[int, int] | None:
+    return next((size for known, size in SIZES.items() if name.upper().startswith(known)), None)
+
+
+def _events(layout: Layout, size: tuple[int, int]) -> Chunks:
+    layout = replace(layout, trouble=layout.trouble.anew("events"))
+    return joined(_pieces(layout), size, where=layout.path, trouble=layout.trouble)
+
+
+def _pieces(layout: Layout) -> Iterator[Piece]:
+    for packet in _packets(layout, POLARITY, 8):
+        words = np.frombuffer(packet.data, "<u4").reshape(-1, 2)
+        x, y, t_us, p, count = _columns(words, packet.since_us)
+        layout.trouble.note("events marked invalid", packet.count - count)
+        yield Piece(x, y, t_us, p)[:count]
+
+
+def _triggers(layout: Layout) -> Triggers:
+    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
+    found: list[tuple[int, int, int]] = []
+    for packet in _packets(layout, SPECIAL, 8):
+        for word, time in struct.iter_unpack("<Ii", packet.data):
+            edge = EDGES.get(word >> 1 & 0x7F)
+            if word & 1 and time >= 0 and edge is not None:
+                found.append((packet.since_us + time, *edge))
+    t_us, edge, channel = zip(*found, strict=True) if found else ((), (), ())
+    return Triggers(np.array(t_us, np.int64), np.array(edge, np.int8), np.array(channel, np.uint8))
+
+
+def _frames(layout: Layout) -> Iterator[Frame]:
+    layout = replace(layout, trouble=layout.trouble.anew("frames"))
+    for packet in _packets(layout, FRAME, FRAME_HEAD.size):
+        for first in range(0, len(packet.data), packet.size):
+            frame = _frame(packet.data[first : first + packet.size], packet.since_us)
+            layout.trouble.note("damaged or partial frames", int(frame is None))
+            if frame is not None:
+                yield frame
+
+
+def _frame(data: bytes, since_us: int) -> Frame | None:
+    """The picture, or None if it is not one of the whole sensor."""
+    info, _, _, opened, closed, width, height, left, top = FRAME_HEAD.unpack_from(data)
+    channels = info >> 1 & 7
+    count = width * height * channels
+    sound = info & 1 and channels in (1, 3, 4) and width > 0 and height > 0
+    sound = sound and FRAME_HEAD.size + 2 * count <= len(data)
+    if not sound or left or top or not 0 <= opened <= closed:
+        return None
+    pixels = np.frombuffer(data, "<u2", count, FRAME_HEAD.size)
+    image = pixels.reshape(height, width, channels)
+    image = image[..., 0] if channels == 1 else image[..., :3]
+    return Frame(image.astype(np.uint16), since_us + opened, since_us + closed)
+
+
+def _packets(layout: Layout, kind: int, least: int) -> Iterator[Packet]:
+    """The packets of one kind and of the source chosen; the others are passed over unread."""
+    length = layout.path.stat().st_size
+    with layout.path.open("rb") as file:
+        place = layout.begin
+        while place < length:
+            start = _head(file, place)
+            if start is None or (room := _room(file, place, start, length)) is None:
+                layout.trouble.note("torn ends of the file")
+                return
+            place += HEAD.size
+            if (start.kind, start.source) == (kind, layout.source) and start.count:
+                file.seek(place)
+                data = file.read(start.size * start.count)
+                # Only frames may be of any size.
+                if start.size == least or (kind == FRAME and start.size > least):
+                    yield Packet(start.size, start.overflow << 31, start.count, data)
+                else:
+                    layout.trouble.note("damaged packets")
+            place += start.size * room
+
+
+def _head(file: BinaryIO, place: int) -> Head | None:
+    """What a packet says of itself, if that can be."""
+    file.seek(place)
+    data = file.read(HEAD.size)
+    if len(data) < HEAD.size:
+        return None
+    found = Head(*HEAD.unpack(data))
+    sound = 0 < found.size and 0 <= found.time_at < found.size and found.overflow >= 0
+    sound = sound and 0 <= found.valid <= found.count <= found.capacity
+    return found if sound and found.size * found.count <= LARGEST else None
+
+
+def _room(file: BinaryIO, place: int, start: Head, length: int) -> int | None:
+    """For how many events a packet has room: for all that it could hold, or that it does hold."""
+    for room in (start.capacity, start.count):
+        end = place + HEAD.size + start.size * room
+        if end == length or (end < length and _head(file, end) is not None):
+            return room
+    # The packet is whole, and damage follows.
+    return start.count if place + HEAD.size + start.size * start.count <= length else None
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _columns(words, since_us):
+    """x, y, t and p of the valid events, and how many there are."""
+    x, y = np.empty(len(words), np.uint16), np.empty(len(words), np.uint16)
+    t_us, p = np.empty(len(words), np.int64), np.empty(len(words), np.int8)
+    count = 0
+    for i in range(len(words)):
+        word = words[i, 0]
+        if word & 1 and words[i, 1] < 0x80000000:
+            x[count], y[count] = word >> 17, (word >> 2) & 0x7FFF
+            t_us[count], p[count] = since_us + words[i, 1], 1 if word & 2 else -1
+            count += 1
+    return x, y, t_us, p, count

@@ -1,0 +1,262 @@
+"""Prophesee's RAW files: a header of text, then words of EVT2, EVT2.1 or EVT3.
+
+Cameras with this sensor also send the same words in packets over ROS; `decoded` takes them from
+anywhere. Times are those of the camera's clock, which began before the recording.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int64
+
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.bytes import blocks
+from sharpfield.recordings.chunks import CHUNK, Piece, Reorder, joined, known_size
+from sharpfield.recordings.prophesee.evt_decode import (
+    NO_ROW,
+    REMEMBERED,
+    ROOM,
+    ROW,
+    STARTED,
+    UNCONFIRMED,
+    UNKNOWN,
+    UNTIMED,
+    decode_evt2,
+    decode_evt3,
+    decode_evt21,
+)
+from sharpfield.recordings.prophesee.header import Header, read_header, stated_size
+from sharpfield.recordings.recording import Chunks, Recording, Triggers, Trouble
+
+EDGES = 4096
+"""Trigger edges taken over at once."""
+
+LEGACY_BEFORE = 55
+"""Prophesee's cameras with a lower `system_ID` send the halves of EVT2.1 words the other way."""
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """One of Prophesee's ways to write events."""
+
+    name: str
+    word: str
+    """Type of its words, as numpy names it."""
+    decode: Callable[..., Any]
+    swapped: bool = False
+    """Whether the two halves of a word come the other way round."""
+
+
+ENCODINGS = {
+    "evt2": Encoding("EVT2", "<u4", decode_evt2),
+    "evt2.1": Encoding("EVT2.1", "<u8", decode_evt21),
+    "evt2.1-legacy": Encoding("EVT2.1", "<u8", decode_evt21, swapped=True),
+    "evt3": Encoding("EVT3", "<u2", decode_evt3),
+}
+
+VERSIONS = {"2.0": "evt2", "2": "evt2", "2.1": "evt2.1", "3.0": "evt3", "3": "evt3"}
+NAMES = {f"EVT{version.replace('.', '')}": name for version, name in VERSIONS.items()} | {
+    f"EVT{version}": name for version, name in VERSIONS.items()
+}
+
+COUNTS = {
+    UNTIMED: "events before the first time",
+    UNCONFIRMED: "times out of line with those before and after",
+    UNKNOWN: "words of no known type",
+}
+
+
+def open_evt(
+    path: Path | str, *, size: tuple[int, int] | None = None, encoding: str | None = None
+) -> Recording:
+    """Open a RAW file.
+
+    Args:
+        path: Of the file.
+        size: Width and height of the sensor, where the header does not say.
+        encoding: One of `ENCODINGS`; overrules what the header says.
+
+    Raises:
+        CaptureError: It is no such file, or size or encoding are not known.
+    """
+    path = Path(path)
+    header = read_header(path)
+    chosen = _encoding(header, path, encoding)
+    size = known_size(stated_size(header, path, size), size, path)
+    origin_us = header.number("time_origin_us") or 0
+    bayer = header.fields.get("bayer", "")
+    trouble = Trouble()
+
+    def words() -> Iterator[bytes]:
+        return blocks(path, header.length)
+
+    def events() -> Chunks:
+        noted = trouble.anew("events")
+        for part in decoded(chosen, words(), size, where=path, trouble=noted):
+            yield replace(part, t_us=part.t_us + origin_us if origin_us else part.t_us, bayer=bayer)
+
+    def triggers() -> Triggers:
+        found = trigger_edges(chosen, words(), where=path)
+        return replace(found, t_us=found.t_us + origin_us)
+
+    return Recording(
+        path,
+        ENCODINGS[chosen].name,
+        size=size,
+        events=events,
+        triggers=triggers,
+        bayer=bayer,
+        trouble=trouble,
+        notes=dict(header.fields),
+    )
+
+
+def decoded(
+    encoding: str,
+    data: Iterable[bytes],
+    size: tuple[int, int],
+    *,
+    where: object,
+    trouble: Trouble,
+) -> Chunks:
+    """Events of an encoded stream, cut into blocks anywhere.
+
+    Args:
+        encoding: One of `ENCODINGS`.
+        data: The blocks.
+        size: Width and height of the sensor.
+        where: The file, for messages.
+        trouble: Is told what was left out.
+
+    Raises:
+        CaptureError: The words are not of this encoding, or times are not in order.
+    """
+    decoder = _Decoder(ENCODINGS[encoding], where, trouble)
+    return joined(decoder.pieces(data), size, where=where, trouble=trouble)
+
+
+def trigger_edges(encoding: str, data: Iterable[bytes], *, where: object) -> Triggers:
+    """Edges on the trigger inputs, of a stream as `decoded` takes it, in the order of time."""
+    decoder = _Decoder(ENCODINGS[encoding], where, Trouble())
+    for _ in decoder.pieces(data):
+        pass
+    edges = np.concatenate([np.empty((0, 3), np.int64), *decoder.edges])
+    edges = edges[np.argsort(edges[:, 0], kind="stable")]
+    return Triggers(edges[:, 0], edges[:, 1].astype(np.int8), edges[:, 2].astype(np.uint8))
+
+
+class _Decoder:
+    """What goes on from block to block."""
+
+    def __init__(self, encoding: Encoding, where: object, trouble: Trouble) -> None:
+        self._encoding, self._where, self._trouble = encoding, where, trouble
+        self._state = np.zeros(REMEMBERED, np.int64)
+        self._state[ROW] = NO_ROW
+        self._words = np.empty(0, encoding.word)
+        self._odd = b""
+        self._untimed = 0
+        self._room = Reorder()
+        self._found = np.empty((EDGES, 3), np.int64)
+        self.edges: list[Int64[np.ndarray, "n 3"]] = []
+
+    def pieces(self, data: Iterable[bytes]) -> Iterator[Piece]:
+        """Decode it all."""
+        for block in data:
+            self._take(block)
+            yield from self._decode(last=False)
+        yield from self._decode(last=True)
+        assert not len(self._words), "a decoder leaves nothing where nothing follows"
+        self._trouble.note("torn words", int(len(self._odd) > 0))
+        if self._untimed and not self._state[STARTED]:
+            raise CaptureError(
+                f"there are no times in the data, as if they were no {self._encoding.name}",
+                where=self._where,
+                got=f"{self._untimed} events",
+                do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
+            )
+        yield self._room.taken(last=True)
+
+    def _take(self, block: bytes) -> None:
+        data = self._odd + block if self._odd else block
+        count = len(data) // np.dtype(self._encoding.word).itemsize
+        words = np.frombuffer(data, self._encoding.word, count)
+        self._odd = data[words.nbytes :]
+        if self._encoding.swapped:
+            words = words >> np.uint64(32) | words << np.uint64(32)
+        self._words = np.concatenate([self._words, words]) if len(self._words) else words
+
+    def _decode(self, *, last: bool) -> Iterator[Piece]:
+        """Decode the words that are there, and yield whenever the room is full."""
+        decode, room = self._encoding.decode, self._room
+        while True:
+            count = len(self._words)
+            used, room.end, found = decode(
+                self._words, self._state, last, room.columns, room.end, self._found
+            )
+            self._words = self._words[used:]
+            self.edges += [self._found[:found].copy()] if found else []
+            self._tell(count)
+            if room.end + ROOM > CHUNK:
+                yield room.taken(last=False)
+            elif not used or not len(self._words):
+                return
+
+    def _tell(self, count: int) -> None:
+        if self._state[UNKNOWN] > max(count // 4, 16):
+            raise CaptureError(
+                f"the data are no {self._encoding.name}",
+                where=self._where,
+                got=f"{self._state[UNKNOWN]} of {count} words are of no known type",
+                do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
+            )
+        self._untimed += int(self._state[UNTIMED])
+        for place, kind in COUNTS.items():
+            self._trouble.note(kind, int(self._state[place]))
+            self._state[place] = 0
+
+
+def _encoding(header: Header, path: Path, given: str | None) -> str:
+    """Which of `ENCODINGS` a file has."""
+    if given is not None:
+        if given not in ENCODINGS:
+            raise OptionError(
+                "unknown encoding", got=given, do=f"use one of {', '.join(ENCODINGS)}"
+            )
+        return given
+    name, version = header.format[""], header.fields.get("evt", "")
+    if not name and not version:
+        raise CaptureError(
+            "the file does not say how its events are encoded",
+            where=path,
+            got="a header without `evt` or `format`" if header.length else "no header",
+            do=f"give the encoding: one of {', '.join(ENCODINGS)}",
+        )
+    found = NAMES.get(name.upper()) if name else VERSIONS.get(version)
+    if found is None:
+        raise CaptureError(
+            "events are encoded in a way that cannot be read here",
+            where=path,
+            got=name or f"evt {version}",
+            do="convert the file with the maker's tools",
+        )
+    return found + "-legacy" if found == "evt2.1" and _halves_swapped(header, path) else found
+
+
+def _halves_swapped(header: Header, path: Path) -> bool:
+    """Whether EVT2.1 words come with their upper half first, as from an IMX636."""
+    order = header.format.get("endianness") or header.fields.get("endianness")
+    if order in ("little", "legacy"):
+        return order == "legacy"
+    if order is not None:
+        raise CaptureError(
+            "unknown order of bytes",
+            where=path,
+            got=order,
+            do="convert the file with the maker's tools",
+        )
+    maker = header.fields.get("integrator_name", "Prophesee")
+    system = header.number("system_id")
+    return maker == "Prophesee" and system is not None and 0 < system < LEGACY_BEFORE

@@ -1,0 +1,141 @@
+"""The text at the beginning of Prophesee's files: lines of `% keyword value`.
+
+It ends where a line does not begin so, or after `% end`. Older files say neither their size nor
+their encoding in full; then the camera does, by the name of its plug-in or its number. Programs
+differ in capitals, in blanks, and in how they write a size; all of it is read.
+
+Source: Prophesee, *RAW file format* and *DAT file format* (Metavision documentation).
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.bytes import head
+
+LONGEST, WHOLE = 1024, 2**16
+"""Most bytes of a line and of a header."""
+
+GEOMETRY = r"([0-9]{1,5}) *[xX,*] *([0-9]{1,5})"
+"""How programs write a size."""
+
+SIZES = {
+    "genx320": (320, 320),
+    "imx637": (640, 512),
+    "imx647": (640, 512),
+    "imx636": (1280, 720),
+    "imx646": (1280, 720),
+    "gen4": (1280, 720),
+    "gen3": (640, 480),
+}
+"""Width and height by what a plug-in's name contains."""
+
+SYSTEMS = {
+    **dict.fromkeys((21, 23, 25, 28, 29, 33, 34, 35, 40, 41), (640, 480)),
+    **dict.fromkeys((26, 30, 31, 32, 39, 46, 48, 49, 50, 53, 58), (1280, 720)),
+    **dict.fromkeys((52, 54), (640, 512)),
+    64: (320, 320),
+}
+"""Width and height by `system_ID`, of Prophesee's own cameras."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the text says."""
+
+    fields: dict[str, str]
+    """By keywords in small letters."""
+    length: int
+    """Bytes of it; the data begin there."""
+
+    def number(self, *names: str) -> int | None:
+        """The first of these fields that is a whole number, or begins with one, as 2.0 does."""
+        for name in names:
+            if match := re.fullmatch(r"(-?[0-9]{1,18})(\.[0-9]*)?", self.fields.get(name, "")):
+                return int(match[1])
+        return None
+
+    @property
+    def format(self) -> dict[str, str]:
+        """The parts of `format`, e.g. {"": "EVT3", "height": "720", "width": "1280"}."""
+        name, *options = self.fields.get("format", "").split(";")
+        pairs = [option.partition("=") for option in options]
+        return {"": name.strip()} | {key.strip().lower(): value.strip() for key, _, value in pairs}
+
+
+def read_header(path: Path) -> Header:
+    """The header of a file; it has no fields if there is none.
+
+    Raises:
+        CaptureError: The file cannot be read.
+    """
+    data = head(path, WHOLE)
+    fields: dict[str, str] = {}
+    at = 0
+    while data[at : at + 1] == b"%":
+        stop = data.find(b"\n", at, at + LONGEST)
+        if stop < 0 and len(data) < WHOLE:
+            stop = len(data)  # nothing follows a header whose last line does not end
+        line = _text(data[at + 1 : stop]) if stop >= 0 else None
+        if line is None:
+            break
+        at = min(stop + 1, len(data))
+        keyword, value = [*line.split(maxsplit=1), "", ""][:2]
+        if keyword.lower() == "end":
+            break
+        fields.setdefault(keyword.lower(), value.strip())
+    return Header(fields, at)
+
+
+def stated_size(
+    header: Header, path: Path, given: tuple[int, int] | None
+) -> tuple[int, int] | None:
+    """Width and height as the header says, or as the camera has that it names; else None.
+
+    Args:
+        header: Of the file.
+        path: Of the file, for the message.
+        given: What the caller says: it decides where the header only names a camera, or names
+            several sizes.
+
+    Raises:
+        CaptureError: The header contradicts itself.
+    """
+    found = set()
+    if match := re.fullmatch(GEOMETRY, header.fields.get("geometry", "")):
+        found.add((int(match[1]), int(match[2])))
+    for known in (Header(header.format, 0), header):
+        width, height = (known.number(name) for name in ("width", "height"))
+        if width and height:
+            found.add((width, height))
+    if given in found:
+        return given
+    if len(found) > 1:
+        raise CaptureError(
+            "the header gives more than one size of the sensor",
+            where=path,
+            got=" and ".join(f"{width} x {height}" for width, height in sorted(found)),
+            do="give the size that is right",
+        )
+    return next(iter(found), None) or given or _size_of_camera(header)
+
+
+def _size_of_camera(header: Header) -> tuple[int, int] | None:
+    plugin = header.fields.get("plugin_name", "").lower()
+    for part, size in SIZES.items():
+        if part in plugin:
+            return size
+    maker = header.fields.get("integrator_name", "Prophesee")
+    number = header.number("system_id")
+    return SYSTEMS.get(number & 0x7F) if number and maker == "Prophesee" and not plugin else None
+
+
+def _text(line: bytes) -> str | None:
+    """The line, or None if it is data: these hold bytes that no text does."""
+    try:
+        text = line.decode("utf-8")
+    except UnicodeDecodeError:
+        text = line.decode("latin-1")
+    text = text.rstrip("\r").replace("\t", " ")
+    return text if text.isprintable() else None

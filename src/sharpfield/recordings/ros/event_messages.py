@@ -1,0 +1,202 @@
+"""Messages of events, as drivers of event cameras send them over ROS.
+
+    dvs_msgs, prophesee_event_msgs   EventArray: size of the sensor; x, y, time and polarity of each
+    event_camera_msgs                EventPacket: size of the sensor, an encoding, and the payload
+                                     as the camera sent it
+
+Source: the message definitions of these packages.
+
+Images as ROS sends them, plain (`sensor_msgs/Image`) or as PNG or JPEG (`CompressedImage`).
+
+Source: the message definitions of `sensor_msgs`, and `image_encodings.h` for names of pixels.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple, no_type_check
+
+import cv2
+import numpy as np
+from jaxtyping import Shaped
+from numba import njit
+
+from sharpfield.recordings.bytes import Damaged
+from sharpfield.recordings.chunks import CHUNK, Piece, Reorder
+from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.ros.bag import Fields, Message, Topic
+
+ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
+PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
+"""The second is what the first was called before."""
+
+EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("on", "u1")])
+PADDED_EVENT = np.dtype(
+    {
+        "names": ["x", "y", "s", "ns", "on"],
+        "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
+        "offsets": [1, 3, 7, 11, 15],
+        "itemsize": 16,
+    }
+)
+"""In ROS 2 numbers are aligned, and so every event but the first has three bytes of padding."""
+
+
+class Start(NamedTuple):
+    """What an event message says before its events."""
+
+    stamp_ns: int
+    size: tuple[int, int]
+
+
+class Packet(NamedTuple):
+    """Encoded events."""
+
+    stamp_ns: int
+    """When the first of them reached the driver."""
+    base_ns: int
+    """What their times count from, in some encodings."""
+    encoding: str
+    payload: memoryview
+
+
+def start(fields: Fields) -> Start:
+    """Time and size of the sensor, with which all messages of events begin."""
+    stamp_ns = fields.header_ns()
+    height, width = fields.number("I"), fields.number("I")
+    return Start(stamp_ns, (width, height))
+
+
+def event_arrays(messages: Iterable[Message], topic: Topic, trouble: Trouble) -> Iterator[Piece]:
+    """The events of consecutive messages of `ARRAYS`, decoded right to where they stay."""
+    room = Reorder()
+    for message in messages:
+        try:
+            parts = _stored(message, topic)
+        except Damaged:
+            trouble.note("damaged messages")
+            continue
+        for events in parts:
+            done = 0
+            while done < len(events):
+                count = min(len(events) - done, CHUNK - room.end)
+                room.end = _decode(events[done : done + count], room.columns, room.end)
+                done += count
+                if room.end == CHUNK:
+                    yield room.taken(last=False)
+    yield room.taken(last=True)
+
+
+def event_packet(message: Message, topic: Topic) -> Packet:
+    """The payload of a message of `PACKETS`.
+
+    Raises:
+        Damaged: It is torn.
+    """
+    fields = Fields(message, topic)
+    stamp_ns, _ = start(fields)
+    fields.number("Q")
+    base_ns = fields.number("Q")
+    encoding = fields.text()
+    fields.number("B")
+    if base_ns >= 2**62:
+        raise Damaged("a time that lies centuries ahead")
+    return Packet(stamp_ns, base_ns, encoding, fields.take(fields.number("I")))
+
+
+def _stored(message: Message, topic: Topic) -> list[np.ndarray]:
+    """The events of a message as they are there, in one or two parts."""
+    fields = Fields(message, topic)
+    start(fields)
+    count = fields.number("I")
+    if not topic.cdr or not count:
+        return [np.frombuffer(fields.take(13 * count), EVENT)]
+    first = np.frombuffer(fields.take(13), EVENT)
+    # The last one is not padded, as nothing follows.
+    return [first, np.frombuffer(fields.take(16 * (count - 1)), PADDED_EVENT)]
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _decode(events, columns, end):
+    """Write events from `end` on; how many there are then."""
+    x, y, t, p = columns
+    e = np.uint64(end)  # unsigned: numba would look for negative indices
+    for i in range(events.size):
+        event = events[i]
+        x[e], y[e] = event.x, event.y
+        # No nanoseconds of a second come near the end of 32 bits.
+        parts = (event.ns + np.uint32(500)) // np.uint32(1000)
+        t[e] = np.int64(event.s) * 1_000_000 + np.int64(parts)
+        p[e] = 1 if event.on else -1
+        e += np.uint64(1)
+    return np.int64(e)
+
+
+PLAIN, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
+
+PIXELS: dict[str, tuple[type[np.unsignedinteger], int, str]] = {
+    "mono8": (np.uint8, 1, ""),
+    "8UC1": (np.uint8, 1, ""),
+    "mono16": (np.uint16, 1, ""),
+    "16UC1": (np.uint16, 1, ""),
+    "rgb8": (np.uint8, 3, "RGB"),
+    "bgr8": (np.uint8, 3, "BGR"),
+    "8UC3": (np.uint8, 3, "BGR"),
+    "rgba8": (np.uint8, 4, "RGB"),
+    "bgra8": (np.uint8, 4, "BGR"),
+    "rgb16": (np.uint16, 3, "RGB"),
+    "bgr16": (np.uint16, 3, "BGR"),
+    **{
+        f"bayer_{tile}{bits}": (kind, 1, tile.upper())
+        for tile in ("rggb", "bggr", "gbrg", "grbg")
+        for bits, kind in (("8", np.uint8), ("16", np.uint16))
+    },
+}
+"""Type and channels of a pixel, and the order of colours, or the tile of filters before them."""
+
+
+class Image(NamedTuple):
+    """A picture and its time."""
+
+    stamp_ns: int
+    image: Shaped[np.ndarray, "h w *c"]
+    bayer: str
+
+
+def image(message: Message, topic: Topic) -> Image:
+    """The picture of a message.
+
+    Raises:
+        Damaged: It is torn, or its pixels are of no known type.
+    """
+    fields = Fields(message, topic)
+    stamp_ns = fields.header_ns()
+    if topic.kind == COMPRESSED:
+        fields.text()
+        return Image(stamp_ns, _unpacked(fields.take(fields.number("I"))), "")
+    height, width = fields.number("I"), fields.number("I")
+    encoding, big_endian, step = fields.text(), fields.number("B"), fields.number("I")
+    data = np.frombuffer(fields.take(fields.number("I")), np.uint8)
+    if encoding not in PIXELS:
+        raise Damaged(f"pixels of type {encoding!r}")
+    kind, channels, colours = PIXELS[encoding]
+    row = width * channels * np.dtype(kind).itemsize
+    if not (height and width) or row > step or height * step > len(data):
+        raise Damaged("a torn image")
+    stored = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
+    pixels = stored.view(np.dtype(kind).newbyteorder(">" if big_endian else "<"))
+    found = pixels.astype(kind).reshape(height, width, channels)
+    if channels == 1:
+        return Image(stamp_ns, found[..., 0], colours)
+    return Image(stamp_ns, found[..., :3] if colours == "RGB" else found[..., 2::-1], "")
+
+
+def _unpacked(data: memoryview) -> Shaped[np.ndarray, "h w *c"]:
+    if not len(data):
+        raise Damaged("an empty image")
+    try:
+        found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise Damaged(str(error)) from None
+    if found is None or found.dtype not in (np.uint8, np.uint16):
+        raise Damaged("no image")
+    return found if found.ndim == 2 else np.ascontiguousarray(found[..., 2::-1])

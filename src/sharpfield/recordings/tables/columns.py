@@ -1,0 +1,151 @@
+"""Events that a file keeps as columns, turned into a recording: what HDF5, npz and npy share.
+
+A file is described as a `storage.EventFile`; here it is read a chunk at a time. Events outside the
+sensor are left out and counted, and so is whatever follows a part that cannot be read. Units of
+time and sizes of sensors that the file does not tell are asked for: they are never guessed.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int64, Shaped
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.chunks import expect_inside
+from sharpfield.recordings.recording import Chunks, Recording, Trouble
+from sharpfield.storage.event_columns import UNITS
+from sharpfield.storage.event_file import CHUNK, EventFile
+
+Open = Callable[[], EventFile]
+"""Opens the file anew."""
+
+
+def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
+    """A recording of the events of a file.
+
+    Raises:
+        CaptureError: The file cannot be opened, or the unit of its times or the size of its
+            sensor is not known.
+    """
+    trouble = Trouble()
+    with open_file() as file:
+        _expect_unit(file)
+        _expect_size(file)
+        whole = _whole_numbers(file)
+        notes = {} if file.thresholds is None else _thresholds(file.thresholds)
+        size, bayer = file.size, file.bayer
+
+    def events() -> Chunks:
+        with open_file() as opened:
+            yield from _chunks(opened, trouble.anew("events"), whole=whole)
+
+    return Recording(
+        path, layout, size=size, events=events, bayer=bayer, trouble=trouble, notes=notes
+    )
+
+
+def _chunks(file: EventFile, trouble: Trouble, *, whole: bool) -> Chunks:
+    before: int | None = None
+    outside = 0
+    for first in range(0, len(file), CHUNK):
+        last = min(first + CHUNK, len(file))
+        try:
+            stored = {name: file.stored(name, first, last) for name in file.columns}
+        except CaptureError:
+            if not first:
+                raise
+            trouble.note("events from a damaged part onwards", len(file) - first)
+            return
+        kept = _inside(stored, file.size, whole=whole)
+        outside += (left_out := int((~kept).sum()))
+        trouble.note("events outside the sensor", left_out)
+        if left_out:
+            assert file.size is not None, "the size was expected when the file was opened"
+            column, row = (float(np.nan_to_num(stored[name]).max()) for name in ("x", "y"))
+            expect_inside(outside, last, (column, row), file.size, file.path)
+        columns = {name: column[kept] for name, column in stored.items()}
+        if whole:
+            columns |= {name: columns[name].astype(np.uint16) for name in ("x", "y")}
+        numbers = first + np.flatnonzero(kept)
+        part = replace(file, columns=columns, ms_to_idx=None).part(0, len(numbers))
+        _expect_order(part.t_us, numbers, before, file.path)
+        if len(part):
+            before = int(part.t_us[-1])
+            yield part
+
+
+def _inside(
+    stored: dict[str, Shaped[np.ndarray, "n"]], size: tuple[int, int] | None, *, whole: bool
+) -> Bool[np.ndarray, "n"]:
+    """Which events lie on the sensor; rectified ones may lie a sensor's width beside it."""
+    assert size is not None, "the size was expected when the file was opened"
+    kept = np.ones(len(stored["t"]), bool)
+    for name, pixels in zip(("x", "y"), size, strict=True):
+        column = stored[name]
+        if whole or column.dtype.kind != "f":
+            kept &= (column >= 0) & (column < pixels)
+            if whole and column.dtype.kind == "f":
+                kept &= np.floor(column) == column
+        else:
+            kept &= (column >= -pixels) & (column <= 2 * pixels - 1)
+    return kept
+
+
+def _expect_order(
+    t_us: Int64[np.ndarray, "n"],
+    numbers: Int64[np.ndarray, "n"],
+    before: int | None,
+    path: Path,
+) -> None:
+    back = np.flatnonzero(np.diff(t_us) < 0)
+    if before is not None and len(t_us) and t_us[0] < before:
+        number, pair = numbers[0], (before, t_us[0])
+    elif len(back):
+        number, pair = numbers[back[0] + 1], (t_us[back[0]], t_us[back[0] + 1])
+    else:
+        return
+    raise CaptureError(
+        "event times are not ascending",
+        where=f"{path}, event {number}",
+        got=f"{pair[1]} us after {pair[0]} us",
+        do="sort the events by time (stable), and check that clock wraps were undone",
+    )
+
+
+def _whole_numbers(file: EventFile) -> bool:
+    """Whether coordinates are whole numbers: rectified ones never are in a whole chunk."""
+    with np.errstate(invalid="ignore"):  # floats that are not even proper NaN
+        return all(
+            bool(((np.floor(column) == column) | ~np.isfinite(column)).all())
+            for column in (file.stored(name, 0, min(len(file), CHUNK)) for name in ("x", "y"))
+        )
+
+
+def _expect_unit(file: EventFile) -> None:
+    if file.unit is not None or not len(file):
+        return
+    first, last = (file.stored("t", i, i + 1)[0].item() for i in (0, len(file) - 1))
+    lasts = ", ".join(
+        f"{(last - first) * UNITS[unit] / 1e6:.4g} s if {unit}" for unit in ("ns", "us", "ms", "s")
+    )
+    raise CaptureError(
+        "the file does not say the unit of its event times",
+        where=file.path,
+        got=f"{first} to {last}, which is {lasts}",
+        do="give the unit: ns, us, ms or s",
+    )
+
+
+def _expect_size(file: EventFile) -> None:
+    if file.size is None:
+        raise CaptureError(
+            "the file does not say the size of its sensor",
+            where=file.path,
+            do="give width and height in pixels",
+        )
+
+
+def _thresholds(known: tuple[float, float]) -> dict[str, str]:
+    return {"threshold_off": repr(known[0]), "threshold_on": repr(known[1])}

@@ -1,0 +1,339 @@
+"""Events in numpy's own files, as the papers that train on events share them.
+
+    npz, x y t p            EventNeRF, vid2e and many more; the unit is not told, unless it is ours
+    npz, position timestamp polarity    robust and deblur e-NeRF; ns
+    folder of npz, x y t p  vid2e: one for each gap between frames, `0000000000.npz` ...; ns
+    npy, records            of named fields x, y, t, p; the unit is not told
+    npy, a table            rows x y t p (BeNeRF) or t x y p (v2e, ECD); the unit is not told
+
+Which column of a table is which follows from what the others cannot be: times ascend, and
+polarities take two values. Where that leaves a choice, the caller is asked.
+
+Source: Gehrig et al., *Video to Events* (CVPR 2020); Rudnev et al., *EventNeRF* (CVPR 2023); Low
+and Lee, *Robust e-NeRF* (ICCV 2023); Li et al., *BeNeRF* (ECCV 2024).
+
+The data sets N-MNIST and N-Caltech101: five bytes per event, one small file per picture.
+
+    x, 1 byte; y, 1 byte; polarity, 1 bit; time in us, 23 bits, most significant byte first
+
+The file says no size. A row of 240 is no row: such a record says that 2^13 us have gone by.
+
+Source: Orchard et al., *Converting static image datasets to spiking neuromorphic datasets using
+saccades* (Frontiers in Neuroscience 2015), and the reader its authors publish.
+"""
+
+import re
+import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Shaped
+
+from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.bytes import blocks, head
+from sharpfield.recordings.chunks import Piece, joined, known_size
+from sharpfield.recordings.recording import Chunks, Recording, Trouble
+from sharpfield.recordings.tables.columns import recording_of
+from sharpfield.storage.event_columns import ZippedColumn, known_unit
+from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
+from sharpfield.storage.event_layouts import UNREADABLE_NPZ, open_events
+
+POSITION = {"position.npy", "timestamp.npy", "polarity.npy"}
+ORDERS = ("xytp", "txyp")
+"""What the columns of a table may be."""
+
+NUMBERED = re.compile(r"\d{10}\.npz")
+"""Files of vid2e; no other program is known to name them so."""
+
+Array = Shaped[np.ndarray, "..."]
+
+
+@dataclass(frozen=True)
+class Slice:
+    """One column of an array that has several, read piece by piece."""
+
+    rows: Array | ZippedColumn
+    column: int | str
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    def __getitem__(self, part: slice) -> Array:
+        """Entries `part.start` to `part.stop`."""
+        rows = self.rows[part]
+        if isinstance(self.column, str):
+            return np.array(rows[self.column])
+        return np.array(rows[:, self.column])
+
+
+def open_npz(
+    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
+) -> Recording:
+    """Open an npz file of events.
+
+    Args:
+        path: The file.
+        unit: Of its times (ns, us, ms, s), where it does not say.
+        size: Width and height of the sensor, where it does not say.
+
+    Raises:
+        CaptureError: It holds no events in a known layout, or does not say its unit or size.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = set(archive.namelist())
+    except UNREADABLE_NPZ as error:
+        raise _unreadable(path, error) from None
+    if not names >= POSITION:
+        return recording_of("npz", path, lambda: open_events(path, unit=unit, size=size))
+    return recording_of("Robust e-NeRF npz", path, lambda: _positions(path, unit or "ns", size))
+
+
+def open_npz_folder(
+    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
+) -> Recording:
+    """Open a folder of npz files, each of which goes on where the one before it ends.
+
+    Args:
+        path: The folder.
+        unit: Of their times; ns for the files of vid2e, which are told by their names.
+        size: Width and height of the sensor.
+
+    Raises:
+        CaptureError: There are none, or the unit or the size is not known.
+    """
+    files = sorted(path.glob("*.npz"))
+    if not files:
+        raise CaptureError("no npz files found", where=path)
+    if unit is None and all(NUMBERED.fullmatch(file.name) for file in files):
+        unit = "ns"
+    opened = [open_npz(file, unit=unit, size=size) for file in files]
+
+    trouble = Trouble()
+
+    def events() -> Chunks:
+        before: int | None = None
+        noted = trouble.anew("events")
+        for file in opened:
+            for chunk in file.chunks():
+                if before is not None and chunk.t_us[0] < before:
+                    raise CaptureError(
+                        "event times are not ascending",
+                        where=f"{file.path}, event 0",
+                        got=f"{chunk.t_us[0]} us after {before} us at the end of the file before",
+                        do="name the files in the order of time",
+                    )
+                before = int(chunk.t_us[-1])
+                yield chunk
+            for kind, count in file.trouble.counts.items():
+                noted.note(kind, count)
+
+    layout = "folder of npz"
+    return replace(opened[0], path=path, layout=layout, events=events, trouble=trouble)
+
+
+def open_npy(
+    path: Path,
+    *,
+    unit: str | None = None,
+    size: tuple[int, int] | None = None,
+    columns: str | None = None,
+) -> Recording:
+    """Open an npy file of events: a table of four columns, or records.
+
+    Args:
+        path: The file.
+        unit: Of its times (ns, us, ms, s).
+        size: Width and height of the sensor.
+        columns: What the columns of a table are: "xytp" or "txyp".
+
+    Raises:
+        CaptureError: It holds no events, or the unit, the size or the columns are not known.
+    """
+    array = _mapped(path)
+    if array.dtype.names is not None:
+        fields = _fields(array, path)
+        return recording_of(
+            "npy of records",
+            path,
+            lambda: EventFile(
+                path,
+                {name: Slice(array, field) for name, field in fields.items()},
+                unit=known_unit(unit) if unit else None,
+                size=size,
+            ),
+        )
+    if array.ndim != 2 or array.shape[1] != len("xytp") or array.dtype.kind not in "iufb":
+        raise CaptureError(
+            "an npy file of events is a table of four columns, or records x, y, t, p",
+            where=path,
+            got=f"shape {array.shape}, {array.dtype}",
+        )
+    order = columns or _order(array, path)
+    if sorted(order) != sorted("xytp"):
+        raise CaptureError(
+            "unknown order of columns", where=path, got=order, do='write it like "xytp" or "txyp"'
+        )
+    return recording_of(
+        f"npy table {order}",
+        path,
+        lambda: EventFile(
+            path,
+            {name: Slice(array, order.index(name)) for name in "xytp"},
+            unit=known_unit(unit) if unit else None,
+            size=size,
+        ),
+    )
+
+
+def _positions(path: Path, unit: str, size: tuple[int, int] | None) -> EventFile:
+    with ExitStack() as resources:
+        try:
+            archive = resources.enter_context(zipfile.ZipFile(path))
+            position, again = (ZippedColumn(archive, "position.npy", 2) for _ in range(2))
+            columns = {
+                "x": Slice(position, 0),
+                "y": Slice(again, 1),
+                "t": ZippedColumn(archive, "timestamp.npy"),
+                "p": ZippedColumn(archive, "polarity.npy"),
+            }
+        except UNREADABLE_NPZ as error:
+            raise _unreadable(path, error) from None
+        if len({len(column) for column in columns.values()}) != 1 or position.shape[1] != 2:
+            raise CaptureError(
+                "event columns have different lengths",
+                where=path,
+                got=", ".join(f"{name} {len(column)}" for name, column in columns.items()),
+                do="the file may be truncated: copy or convert it again",
+            )
+        return EventFile(
+            path, columns, unit=known_unit(unit), size=size, resources=resources.pop_all()
+        )
+    raise AssertionError("the block above returns or raises")
+
+
+def _mapped(path: Path) -> Array:
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        raise CaptureError("file not found", where=path) from None
+    except UNREADABLE as error:
+        pickled = "allow_pickle" in str(error) or "object" in str(error).lower()
+        raise CaptureError(
+            "file holds pickled Python objects, which may run code when loaded"
+            if pickled
+            else "not a readable npy file",
+            where=path,
+            got="" if pickled else error,
+            do="save it as plain numbers with np.save" if pickled else "copy or write it again",
+        ) from None
+
+
+def _fields(array: Array, path: Path) -> dict[str, str]:
+    """The names of the fields x, y, t, p in records."""
+    known = {"t": ("t", "ts", "timestamp", "time"), "p": ("p", "polarity", "pol", "on")}
+    found = {
+        name: field
+        for name in "xytp"
+        for field in known.get(name, (name,))
+        if field in (array.dtype.names or ())
+    }
+    if len(found) != len("xytp") or array.ndim != 1:
+        raise CaptureError(
+            "records must have the fields x, y, t and p",
+            where=path,
+            got=f"{array.dtype.names}, shape {array.shape}",
+        )
+    return found
+
+
+def _order(array: Array, path: Path) -> str:
+    """The only order of columns that the values allow."""
+    possible = [order for order in ORDERS if _may_be(array, order)]
+    if len(possible) == 1:
+        return possible[0]
+    raise CaptureError(
+        "cannot tell which column is which"
+        if possible
+        else "columns are neither x y t p nor t x y p",
+        where=path,
+        got=f"first row {array[0].tolist() if len(array) else 'none'}",
+        do=f"give columns: one of {', '.join(possible or ORDERS)}",
+    )
+
+
+def _may_be(array: Array, order: str) -> bool:
+    before = -np.inf
+    for rows in _pieces(array):
+        x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
+        if not (np.isin(p, (-1, 0, 1)).all() and np.isfinite(np.stack([x, y])).all()):
+            return False
+        if t[0] < before or (t[1:] < t[:-1]).any():
+            return False
+        before = t[-1]
+    return True
+
+
+def _pieces(array: Array) -> Iterator[Array]:
+    for first in range(0, len(array), CHUNK):
+        yield np.asarray(array[first : first + CHUNK], np.float64)
+
+
+def _unreadable(path: Path, error: Exception) -> CaptureError:
+    return CaptureError(
+        "not a readable npz file", where=path, got=error, do="copy or write it again"
+    )
+
+
+RECORD = 5
+"""Bytes of an event."""
+
+SIZES = {"nmnist": (34, 34), "ncaltech101": (240, 180)}
+"""Width and height of each data set; pictures of N-Caltech101 differ, none is larger."""
+
+NO_ROW, PAUSE_US = 240, 2**13
+"""Row of a record that is no event, and the time it stands for."""
+
+
+def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Recording:
+    """Open a file of N-MNIST or N-Caltech101.
+
+    Args:
+        path: Of the file.
+        size: Width and height of the sensor; see `SIZES`.
+
+    Raises:
+        CaptureError: It is no such file, or the size is not given.
+    """
+    path = Path(path)
+    trouble = Trouble()
+    if len(head(path, RECORD)) < RECORD:
+        raise CaptureError(
+            "the file holds no event", where=path, got="less than 5 bytes", do="copy it again"
+        )
+    size = known_size(None, size, path)
+
+    def pieces(noted: Trouble) -> Iterator[Piece]:
+        rest, paused_us = b"", 0
+        for block in chain(blocks(path), [b""]):
+            rest += block
+            records = np.frombuffer(rest, np.uint8, len(rest) // RECORD * RECORD)
+            rest = rest[len(records) :]
+            x, y, high, middle, low = records.reshape(-1, RECORD).T.astype(np.int64)
+            pauses = np.cumsum(y == NO_ROW) * PAUSE_US + paused_us
+            paused_us = int(pauses[-1]) if len(pauses) else paused_us
+            t_us = ((high & 0x7F) << 16 | middle << 8 | low) + pauses
+            p = np.where(high >> 7, 1, -1).astype(np.int8)
+            yield Piece(x.astype(np.uint16), y.astype(np.uint16), t_us, p)[y != NO_ROW]
+        noted.note("torn records", int(len(rest) > 0))
+
+    def events() -> Chunks:
+        noted = trouble.anew("events")
+        return joined(pieces(noted), size, where=path, trouble=noted)
+
+    return Recording(path, "N-MNIST", size=size, events=events, trouble=trouble)

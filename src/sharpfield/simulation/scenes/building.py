@@ -1,0 +1,167 @@
+"""Put a scene together: coloured, textured surfaces in front of a camera that looks along +z.
+
+World axes are OpenCV's (x right, y down, z away), so the floor lies at positive y.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from sharpfield.simulation.scenes.surfaces import BALL, BOX, CYLINDER, RECTANGLE, Surfaces
+from sharpfield.simulation.scenes.textures import SOLID, TEXT, page
+
+Real = float | int
+"""Whole numbers may be written without a point; checks at run time tell the two apart."""
+Vector = tuple[Real, Real, Real]
+
+FLAT: Vector = (90.0, 0.0, 0.0)
+"""Lays a rectangle down: a floor."""
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Colours and texture of a surface."""
+
+    ground: str
+    """Display colour as #rrggbb."""
+    ink: str = "#202020"
+    accent: str = "#ffffff"
+    texture: int = SOLID
+    cells: Real = 1.0
+    """Repetitions of the texture in one world unit."""
+    seed: int = 0
+    slant: Real = 0.0
+    text: str = ""
+    """Lettering instead of a texture; on the front of a box or rectangle."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A rectangle, ball, box or cylinder."""
+
+    kind: int
+    centre: Vector
+    half: Vector
+    paint: Paint
+    turn: Vector = (0.0, 0.0, 0.0)
+    """Pitch about x, yaw about y, roll about z, in degrees."""
+    throws_shadow: bool = True
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0)
+    """How far the centre swings (x, y, z), and the period in seconds."""
+
+
+def rectangle(
+    centre: Vector,
+    size: tuple[Real, Real],
+    paint: Paint,
+    *,
+    turn: Vector = (0.0, 0.0, 0.0),
+    throws_shadow: bool = True,
+) -> Surface:
+    """A flat picture of `size` (width, height), upright and facing the camera unless turned."""
+    half = (size[0] / 2, size[1] / 2, 0.0)
+    return Surface(RECTANGLE, centre, half, paint, turn, throws_shadow)
+
+
+def ball(
+    centre: Vector,
+    radius: Real,
+    paint: Paint,
+    *,
+    turn: Vector = (0.0, 0.0, 0.0),
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
+) -> Surface:
+    """A ball."""
+    return Surface(BALL, centre, (radius, radius, radius), paint, turn, sway=sway)
+
+
+def box(
+    centre: Vector,
+    size: Vector,
+    paint: Paint,
+    *,
+    turn: Vector = (0.0, 0.0, 0.0),
+    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
+) -> Surface:
+    """A box of `size` (width, height, depth)."""
+    half = (size[0] / 2, size[1] / 2, size[2] / 2)
+    return Surface(BOX, centre, half, paint, turn, sway=sway)
+
+
+def cylinder(
+    centre: Vector,
+    radius: Real,
+    height: Real,
+    paint: Paint,
+    *,
+    turn: Vector = (0.0, 0.0, 0.0),
+    throws_shadow: bool = True,
+) -> Surface:
+    """An upright cylinder, closed at both ends."""
+    return Surface(CYLINDER, centre, (radius, height / 2, radius), paint, turn, throws_shadow)
+
+
+def build(
+    parts: list[Surface],
+    *,
+    sun: Vector = (-0.5, -0.9, -0.8),
+    ambient: float = 0.5,
+    sky: tuple[str, str] = ("#e8eef4", "#9fc3e6"),
+) -> Surfaces:
+    """The tables that rays are traced through.
+
+    Args:
+        parts: All surfaces.
+        sun: Direction towards the sun.
+        ambient: Share of light that comes from everywhere.
+        sky: Display colours straight ahead and above.
+    """
+    sheets = [page(p.paint.text, p.half[0] / p.half[1]) for p in parts if p.paint.text]
+    rows = max((s.shape[0] for s in sheets), default=2)
+    columns = max((s.shape[1] for s in sheets), default=2)
+    pages = np.zeros((max(len(sheets), 1), rows, columns), np.float32)
+    for pane, sheet in zip(pages, sheets, strict=False):
+        pane[: sheet.shape[0], : sheet.shape[1]] = sheet
+    shape = [
+        (p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow, _reach(p))
+        for p in parts
+    ]
+    look, which = [], 0
+    for part in parts:
+        paint, extent = part.paint, (0, 0, 0)
+        if paint.text:
+            extent = (which, *sheets[which].shape)
+            which += 1
+        colours = [linear(c) for c in (paint.ground, paint.ink, paint.accent)]
+        texture = TEXT if paint.text else paint.texture
+        look.append((*np.ravel(colours), texture, paint.cells, paint.seed, paint.slant, *extent))
+    towards = np.array(sun) / np.linalg.norm(sun)
+    return Surfaces(
+        shape=np.array(shape, float),
+        look=np.array(look, float),
+        pages=pages,
+        sway=np.array([p.sway for p in parts], float),
+        light=np.array([*towards, ambient]),
+        sky=np.array([linear(c) for c in sky]),
+    )
+
+
+def linear(colour: str) -> Float64[np.ndarray, "3"]:
+    """Linear RGB of a display colour written as #rrggbb (gamma 2.2)."""
+    display = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    return np.array(display) ** 2.2
+
+
+def _reach(part: Surface) -> float:
+    """How far a surface goes from its centre."""
+    return float(part.half[0]) if part.kind == BALL else float(np.linalg.norm(part.half))
+
+
+def _axes(turn: Vector) -> Float64[np.ndarray, "3 3"]:
+    """Rows: a turned surface's x, y, z in the world."""
+    x, y, z = np.deg2rad(turn)
+    pitch = [[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]]
+    yaw = [[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]]
+    roll = [[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]]
+    return (np.array(yaw) @ np.array(pitch) @ np.array(roll)).T

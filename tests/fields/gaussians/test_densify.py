@@ -1,0 +1,122 @@
+import pytest
+import torch
+
+from sharpfield.core.protocols import PointSet
+from sharpfield.core.seed import generator
+from sharpfield.fields.gaussians.densify import DEAD, Watch, densify, fade
+from sharpfield.fields.gaussians.static import Gaussians
+from sharpfield.training.surgery import rebuild
+
+SMALL, LARGE, HUGE = 0.005, 0.05, 0.5
+"""Scales in a scene of extent 1."""
+
+
+def chance(step: int = 0) -> torch.Generator:
+    return generator(0, step, "growth")
+
+
+def scene(scales: list[float], opacities: list[float] | None = None) -> Gaussians:
+    count = len(scales)
+    points = torch.arange(3.0 * count).reshape(count, 3)
+    made = Gaussians.start(points, torch.rand(count, 3), torch.tensor(scales))
+    if opacities is not None:
+        made.opacity_logits.data = torch.tensor(opacities).logit()
+    return made
+
+
+def densified(made: Gaussians, wish: list[float], *, budget: int = 99):
+    return densify(made, torch.tensor(wish), 1.0, budget=budget, generator=chance())
+
+
+def test_small_ones_are_cloned():
+    growth = densified(scene([SMALL, SMALL]), [0.0, 1.0])
+    assert growth is not None
+    assert growth.source.tolist() == [0, 1, 1] and growth.fresh.tolist() == [False, False, True]
+    assert torch.equal(growth.values["means"][1], growth.values["means"][2])
+
+
+def test_large_ones_are_split():
+    made = scene([LARGE, LARGE])
+    growth = densified(made, [0.0, 1.0])
+    assert growth is not None
+    assert growth.source.tolist() == [0, 1, 1] and growth.fresh.tolist() == [False, True, True]
+    torch.testing.assert_close(
+        growth.values["log_scales"].exp()[1:], torch.full((2, 3), LARGE / 1.6)
+    )
+    offset = growth.values["means"][1:] - made.means[1]
+    assert offset.norm(dim=-1).min() > 0 and offset.abs().max() < 5 * LARGE
+
+
+def test_halves_are_distributed_as_the_whole_was():
+    made = scene([LARGE] * 4000)
+    made.log_scales.data = torch.tensor([0.09, 0.05, 0.02]).log().repeat(4000, 1)
+    made.quaternions.data = torch.tensor([1.0, 0.0, 0.0, 1.0]).repeat(4000, 1)  # x becomes y
+    growth = densified(made, [1.0] * 4000, budget=9999)
+    assert growth is not None
+    offset = growth.values["means"] - made.means.detach()[growth.source]
+    torch.testing.assert_close(offset.std(0), torch.tensor([0.05, 0.09, 0.02]), rtol=0.05, atol=0)
+
+
+def test_the_transparent_and_the_huge_are_dropped():
+    made = scene([SMALL, SMALL, HUGE], [0.5 * DEAD, 0.5, 0.5])
+    growth = densified(made, [1.0, 0.0, 1.0])
+    assert growth is not None and growth.source.tolist() == [1]
+
+
+def test_the_budget_goes_to_those_that_wish_most():
+    growth = densified(scene([SMALL, LARGE, SMALL, SMALL]), [1.0, 3.0, 2.0, 0.0], budget=6)
+    assert growth is not None
+    assert growth.source.tolist() == [0, 2, 3, 2, 1, 1]
+    full = densified(scene([SMALL] * 3), [1.0] * 3, budget=3)
+    assert full is None
+
+
+def test_content_gaussians_stay_as_they_are():
+    assert densified(scene([SMALL, LARGE]), [1e-4, 1e-4]) is None
+    assert densify(scene([]), torch.zeros(0), 1.0, budget=9, generator=chance()) is None
+
+
+def test_a_watch_averages_over_the_views_that_saw_a_splat():
+    watch = Watch(3)
+    pull = torch.zeros(2, 3, 2)
+    pull[0, 0], pull[1, 0], pull[1, 1] = (
+        torch.tensor([0.03, 0.04]),
+        torch.tensor([0.06, 0.08]),
+        torch.tensor([0.3, 0.4]),
+    )
+    watch.note(pull, (200, 200))
+    torch.testing.assert_close(watch.wish, torch.tensor([7.5, 50.0, 0.0]))
+    watch.note(pull[:1] * 3, (200, 200))
+    torch.testing.assert_close(watch.wish, torch.tensor([10.0, 50.0, 0.0]))
+
+
+def test_a_watch_begins_anew_when_gaussians_grow():
+    made, watch = scene([SMALL, SMALL]), Watch(2)
+    assert isinstance(watch, PointSet)
+    watch.note(torch.ones(1, 2, 2), (2, 2))
+    growth = densified(made, [1.0, 1.0])
+    assert growth is not None
+    optimizer = torch.optim.Adam(made.parameters())
+    rebuild(made, optimizer, growth)
+    rebuild(watch, optimizer, watch.anew(growth))
+    assert len(made) == len(watch.wish) == 4 and not watch.wish.any()
+    assert set(watch.state_dict()) == {"total", "times"}
+    watch.note(torch.ones(1, 4, 2), (2, 2))
+    torch.testing.assert_close(watch.wish, torch.full((4,), 2**0.5))
+
+
+def test_fading_leaves_the_faint_alone_and_their_moments():
+    made = scene([SMALL, SMALL], [0.006, 0.9])
+    optimizer = torch.optim.Adam(made.parameters())
+    made.opacities.sum().backward()
+    optimizer.step()
+    growth = fade(made.opacity_logits)
+    rebuild(made, optimizer, growth)
+    assert made.opacities.tolist() == pytest.approx([0.006, 0.01], rel=2e-2)
+    assert (optimizer.state[made.opacity_logits]["exp_avg"] != 0).tolist() == [True, False]
+
+
+def test_it_depends_on_its_generator_alone():
+    first, again = (densified(scene([LARGE]), [1.0]) for _ in range(2))
+    assert first is not None and again is not None
+    assert torch.equal(first.values["means"], again.values["means"])

@@ -1,0 +1,138 @@
+import math
+
+import pytest
+import torch
+
+from sharpfield.core.points import Growth
+from sharpfield.core.seed import generator
+from sharpfield.fields.gaussians.mcmc import DEAD, idleness, share_out, shared, wander
+from sharpfield.fields.gaussians.static import Gaussians
+
+
+def chance(step: int = 0) -> torch.Generator:
+    return generator(0, step, "growth")
+
+
+def crowd(count: int = 40, *, dead: int = 10) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log scales and opacity logits; the first ones are dead."""
+    opacity = torch.linspace(0.02, 0.98, count)
+    opacity[:dead] = 0.001
+    scales = torch.randn(count, 3, generator=generator(0, 0, "scales"))
+    return scales, opacity.logit()
+
+
+def grown(budget: int = 40, **options) -> tuple[Growth, torch.Tensor, torch.Tensor]:
+    scales, logits = crowd(**options)
+    growth = share_out(scales, logits, budget=budget, generator=chance())
+    assert growth is not None
+    return growth, scales, logits
+
+
+@pytest.mark.parametrize("shares", [1, 2, 5, 51])
+@pytest.mark.parametrize("opacity", [0.3, 0.9, 0.999])
+def test_sharing_changes_neither_the_centre_nor_the_sum_along_a_line(shares: int, opacity: float):
+    """The integral of eq. 9, by brute force."""
+    one = torch.tensor([opacity], dtype=torch.float64)
+    new, factor = shared(one, torch.tensor([shares]))
+    x = torch.linspace(-9, 9, 20_001, dtype=torch.float64)
+    alone = one * torch.exp(-(x**2) / 2)
+    each = new * torch.exp(-(x**2) / (2 * factor**2))
+    together = 1 - (1 - each) ** shares
+    assert together.max().item() == pytest.approx(alone.max().item(), rel=1e-9)
+    # The paper matches the sum of what each of the N stops on its own turn.
+    turns = sum(each * (1 - each) ** i for i in range(shares))
+    torch.testing.assert_close(turns, together)
+    assert turns.sum().item() == pytest.approx(alone.sum().item(), rel=1e-6)
+
+
+def test_the_sum_over_shares_is_that_of_the_paper():
+    opacity = torch.tensor([0.2, 0.7, 0.95], dtype=torch.float64)
+    _, factor = shared(opacity, torch.full((3,), 6))
+    for o, found in zip(opacity.tolist(), factor.tolist(), strict=True):
+        new = max(1 - (1 - o) ** (1 / 6), DEAD)
+        stopped = 0.0
+        for i in range(1, 7):
+            for k in range(i):
+                stopped += math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        assert found == pytest.approx(o / stopped, rel=1e-9)
+
+
+def test_the_dead_move_to_the_live_and_their_number_stays():
+    growth, _, logits = grown()
+    assert len(growth) == 40
+    assert (growth.source[:10] >= 10).all() and growth.fresh[:10].all()
+    assert torch.equal(growth.source[10:], torch.arange(10, 40)) and not growth.fresh[10:].any()
+    assert (growth.values["opacity_logits"].sigmoid() >= 0.99 * DEAD).all()
+
+
+def test_all_who_share_a_place_become_alike_and_others_stay():
+    growth, scales, logits = grown()
+    new_logits, new_scales = growth.values["opacity_logits"], growth.values["log_scales"]
+    chosen = growth.source[:10]
+    for seat, live in enumerate(chosen.tolist()):
+        assert new_logits[seat] == new_logits[live] < logits[live]
+        assert torch.equal(new_scales[seat], new_scales[live])
+    alone = torch.ones(40, dtype=torch.bool)
+    alone[:10] = False
+    alone[chosen] = False
+    assert torch.equal(new_logits[alone], logits[alone])
+    assert torch.equal(new_scales[alone], scales[alone])
+
+
+def test_it_grows_by_a_twentieth_up_to_the_budget():
+    growth, *_ = grown(budget=1000, count=40, dead=0)
+    assert len(growth) == 42 and growth.fresh.tolist() == [False] * 40 + [True] * 2
+    growth, *_ = grown(budget=41, count=40, dead=0)
+    assert len(growth) == 41
+    assert share_out(*crowd(dead=0), budget=40, generator=chance()) is None
+    assert share_out(*crowd(dead=0), budget=7, generator=chance()) is None  # none are taken away
+
+
+def test_the_opaque_are_chosen_more_often():
+    logits = torch.tensor([0.1, 0.3, 0.6, 0.001]).logit().repeat(500)
+    growth = share_out(torch.zeros(2000, 3), logits, budget=9999, generator=chance(), more=4.0)
+    assert growth is not None
+    kind = growth.source[growth.fresh] % 4
+    share = torch.bincount(kind, minlength=4) / len(kind)
+    torch.testing.assert_close(share, torch.tensor([0.1, 0.3, 0.6, 0.0]), atol=0.02, rtol=0)
+
+
+def test_without_anyone_alive_nothing_moves():
+    assert share_out(*crowd(dead=40), budget=99, generator=chance()) is None
+    none = torch.zeros(0)
+    assert share_out(none.reshape(0, 3), none, budget=99, generator=chance()) is None
+
+
+def test_it_depends_on_its_generator_alone():
+    first, again = (share_out(*crowd(), budget=99, generator=chance()) for _ in range(2))
+    other = share_out(*crowd(), budget=99, generator=chance(1))
+    assert first is not None and again is not None and other is not None
+    assert torch.equal(first.source, again.source) and not torch.equal(first.source, other.source)
+
+
+def scene(opacity: float, count: int = 4000) -> Gaussians:
+    shape = torch.tensor([0.3, 0.1, 0.02])
+    made = Gaussians.start(torch.zeros(count, 3), torch.ones(count, 3), torch.ones(count))
+    made.log_scales.data = shape.log().repeat(count, 1)
+    made.quaternions.data = torch.tensor([1.0, 0.0, 0.0, 1.0]).repeat(count, 1)  # x becomes y
+    made.opacity_logits.data = torch.full((count,), math.log(opacity / (1 - opacity)))
+    return made
+
+
+def test_noise_has_the_square_of_the_gaussians_shape():
+    noise = wander(scene(DEAD), 1e-3, chance(), noise=100.0)
+    wanted = 0.5 * 0.1 * torch.tensor([0.1, 0.3, 0.02]) ** 2  # half open at the threshold itself
+    torch.testing.assert_close(noise.std(0), wanted, rtol=0.05, atol=0)
+
+
+def test_the_opaque_do_not_wander():
+    assert wander(scene(0.5), 1e-3, chance()).abs().max() < 1e-15
+    assert wander(scene(1e-4), 1e-3, chance()).std() > 0.1
+
+
+def test_idleness():
+    made = scene(0.25)
+    opacity, scale = idleness(made)
+    assert opacity.item() == pytest.approx(0.25) and scale.item() == pytest.approx(0.42 / 3)
+    (opacity + scale).backward()
+    assert made.log_scales.grad is not None and (made.log_scales.grad > 0).all()

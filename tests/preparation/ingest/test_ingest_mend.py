@@ -1,0 +1,68 @@
+"""Mistakes of the writer of a recording are undone while it is read."""
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sharpfield.captures.native import layout as native
+from sharpfield.core.events import EventStream
+from sharpfield.preparation.ingest.options import Mistakes, mended
+from sharpfield.recordings.recording import Recording
+from tests.cli.command import run
+from tests.recordings.captured import expect_equal_events
+from tests.streams import HEIGHT, WIDTH, random_events
+
+
+def spoiled(events: EventStream, mistakes: Mistakes) -> EventStream:
+    """What a program with these mistakes would have written."""
+    x, y, width, height = events.x, events.y, events.width, events.height
+    x = width - 1 - x if mistakes.flip_x else x
+    y = height - 1 - y if mistakes.flip_y else y
+    p = -events.p if mistakes.flip_polarity else events.p
+    if mistakes.swap_xy:
+        x, y, width, height = y, x, height, width
+    return replace(
+        events,
+        x=x.astype(events.x.dtype),
+        y=y.astype(events.x.dtype),
+        p=p.astype(np.int8),
+        width=width,
+        height=height,
+    )
+
+
+ALL = [Mistakes(*parts) for parts in product((False, True), repeat=4)]
+
+
+@pytest.mark.parametrize("mistakes", ALL, ids=str)
+def test_each_mixture_of_mistakes_is_undone(mistakes: Mistakes) -> None:
+    true = random_events(500)
+    wrong = spoiled(true, mistakes)
+    size = (wrong.width, wrong.height)
+    recording = Recording(
+        Path("x"), "made up", size, events=lambda: iter([wrong[:200], wrong[200:]])
+    )
+    found = mended(recording, mistakes)
+    assert found.size == (WIDTH, HEIGHT)
+    expect_equal_events(found.load(), true)
+    assert (found.layout == "made up") == (mistakes == Mistakes())
+
+
+def test_options_of_ingest_undo_mistakes_of_a_text(tmp_path: Path) -> None:
+    true = random_events(500)
+    mistakes = Mistakes(swap_xy=True, flip_y=True, flip_polarity=True)
+    wrong = spoiled(true, mistakes)
+    table = np.column_stack([wrong.t_us, wrong.x, wrong.y, wrong.p > 0])
+    np.savetxt(tmp_path / "events.txt", table, "%d")
+    words = ("--unit", "us", "--size", f"{WIDTH}x{HEIGHT}", "--hot", 0)
+    flags = ("--swap-xy", "--flip-y", "--flip-polarity")
+    assert run("ingest", tmp_path / "events.txt", "--out", tmp_path / "cap", *words, *flags) == 0
+    found = native.read_unposed(tmp_path / "cap")
+    for name in ("x", "y", "t_us", "p"):
+        np.testing.assert_array_equal(
+            getattr(found.needed_events, name), getattr(true, name), err_msg=name
+        )
+    assert "x and y exchanged" in found.source

@@ -1,0 +1,214 @@
+"""Moving Gaussians: they learn from whatever there is, start where things move, resume alike."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.protocols import Growing, Model
+from sharpfield.core.rays import Rays, Views
+from sharpfield.evaluation.event_scores import SeesEvents
+from sharpfield.geometry.normalise import centred
+from sharpfield.initialisation.moving import backdrop, hull_between
+from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
+from sharpfield.recipes.splats.dynamic_model import DynamicModel
+from sharpfield.recipes.splats.learned_calibration import UnknownOptions
+from sharpfield.rendering.view import ViewRenderer, render_view
+from sharpfield.storage.event_cache import event_index
+from sharpfield.training.checkpoint import file_of
+from sharpfield.training.fit import fit
+from sharpfield.training.optim import adam
+from sharpfield.training.plan import Options
+from sharpfield.training.train import train
+from tests.recipes.moving import tiny_moving
+from tests.training.toy import quiet
+
+STEPS = 40
+
+
+def small(recipe: type[DynamicSplat] = EvDynamicSplat, **changes: Any) -> DynamicSplat:
+    """A recipe at a size for tests."""
+    made = replace(recipe(), steps=STEPS, **changes)
+    return replace(made, gaussians=replace(made.gaussians, grow_every=7))
+
+
+def blurred() -> Capture:
+    return tiny_moving(30_000)
+
+
+CASES = {
+    "both": (EvDynamicSplat, tiny_moving),
+    "both, blurred": (EvDynamicSplat, blurred),
+    "frames": (DynamicSplat, tiny_moving),
+    "frames, blurred": (DynamicSplat, lambda: blurred().without(events=True)),
+    "events": (EvDynamicSplat, lambda: tiny_moving().without(frames=True)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_recipe_learns_from_whatever_there_is(case: str):
+    recipe, capture = CASES[case]
+    steps = 2 * STEPS if case == "events" else STEPS
+    model = small(recipe).lasting(steps).build(capture(), 0)
+    probe = [(step, model.draw(step)) for step in range(steps - 6, steps)]
+
+    @torch.no_grad()
+    def loss() -> float:
+        return sum(float(sum(model.losses(batch, step).values())) for step, batch in probe)
+
+    before = loss()
+    fit(model, adam(model), steps=range(steps))
+    assert loss() < 0.9 * before
+
+
+def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
+    model = small().build(blurred(), 0)
+    late_from = model.heaviest_step
+    early, late = model.draw(late_from - 1), model.draw(late_from)
+    assert set(early) == {"look", "sharp"} and early["look"].shape == (2, 1)
+    assert set(late) == {"look", "rest", "frames", "sharp", "events"}
+    assert late["look"].shape == (2, 4) and late["rest"].shape == (2, 6)
+    assert late["events"].shape == (2, 3, 16, 16, 1)
+    assert len(set(late["look"].track[:, 0].tolist())) == 2, "two cameras"
+    assert (late["look"].time == late["look"].time[:1]).all(), "at the same instants"
+    assert set(model.losses(late, late_from)) == {"blur", "sharp", "events", "idle", "fleeting"}
+    assert set(model.losses(late, STEPS - 1)) == {"blur", "sharp", "events"}, "growing has ended"
+
+
+def test_sharp_frames_are_carried_to_both_ends_of_any_stretch():
+    model = small().build(tiny_moving(), 0)
+    lengths = set()
+    for step in range(model.heaviest_step, STEPS):
+        batch = model.draw(step)
+        assert set(batch) == {"look", "sharp", "events"} and batch["look"].shape == (2, 2)
+        assert batch["events"].shape == (2, 1, 16, 16, 1) and batch["sharp"].shape == (2, 16, 16, 2)
+        first, last = batch["look"].time[0].tolist()
+        assert 0 <= first < last <= 1
+        lengths.add(last - first)
+    assert max(lengths) > 3 * min(lengths)
+
+
+def test_counts_are_those_of_the_camera():
+    """But for the parts of an event that light was on its way at either end."""
+    capture = tiny_moving()
+    model = small().build(capture, 0)
+    drawn = [model.draw(step)["events"] for step in range(model.heaviest_step, STEPS)]
+    seen = max(drawn, key=lambda seen: float((seen.end - seen.start).max()))
+    events, clock = capture.needed_events, capture.clock
+    assert events.track is not None
+    for camera in range(2):
+        first, last = (int(clock.us(float(t[camera, 0, 0, 0, 0]))) for t in (seen.start, seen.end))
+        mine = (events.track == int(seen.track[camera, 0, 0, 0, 0])) & (events.p > 0)
+        mine &= (events.t_us > first) & (events.t_us <= last)
+        counts = np.zeros((16, 16))
+        np.add.at(counts, (events.y[mine], events.x[mine]), 1)
+        assert counts.max() >= 2
+        assert np.abs(seen.positive[camera, 0, ..., 0].numpy() - counts).max() <= 1
+
+
+def test_what_stands_still_learns_alone_at_first():
+    model = small().build(tiny_moving(), 0)
+    pose = model.path.pose(torch.full((1, 1), 0.5), torch.zeros(1, 1, dtype=torch.int64))
+    corner = torch.zeros(1, 1, 2, dtype=torch.int64)
+    views = Views(pose, torch.full((1, 1), 0.5), torch.ones(1, 1), corner, (16, 16))
+    with torch.no_grad():
+        first, later, done = (model.scene.draw(views, step=step).rgb for step in (0, 39, None))
+    assert not torch.equal(first, later) and torch.equal(later, done)
+    moving = next(group for group in model.groups() if group.name == "velocities")
+    assert moving.rate(0) == 0 and moving.rate(39) > 0
+
+
+def test_views_of_different_times_are_drawn_each_at_its_own():
+    model = small().build(tiny_moving(), 0)
+    time = torch.tensor([[0.2], [0.7]])
+    pose = model.path.pose(time, torch.zeros(2, 1, dtype=torch.int64))
+    corner = torch.zeros(2, 1, 2, dtype=torch.int64)
+    with torch.no_grad():
+        both = model.draw_views(Views(pose, time, torch.ones(2, 1), corner, (16, 16))).rgb
+        for row in range(2):
+            alone = render_view(model, model.capture.camera, pose[row, 0], float(time[row, 0]))
+            torch.testing.assert_close(both[row, :, :, 0], alone.rgb)
+
+
+def test_moving_ones_start_where_something_moves():
+    """The hub of the rotor is at the origin, which frames alone always see it cover."""
+    capture, _ = centred(tiny_moving())
+    told = hull_between(capture, event_index(capture.needed_events), (0.3, 0.7))
+    assert told is not None and told.places.norm(dim=-1).min() < 0.1
+    shown = hull_between(capture, None, (0.3, 0.7))
+    assert shown is not None and 0 < shown.kept.sum() < told.kept.sum() < len(told.kept)
+    assert hull_between(capture, None, (0.30, 0.31)) is None, "no frame is there"
+    moving = small().build(tiny_moving(), 0).scene.moving
+    assert moving.moments.min() >= 0 and moving.moments.max() <= 1
+    assert moving.moments.sort().values.diff().max() < 0.1, "at all times"
+
+
+def test_the_backdrop_is_what_cameras_see_most_of_the_time():
+    capture, _ = centred(tiny_moving())
+    pictures = backdrop(capture)
+    frames = capture.needed_frames
+    tracks = np.unique(frames.track[capture.split.train])
+    assert len(pictures) == len(tracks)
+    own = capture.split.train[frames.track[capture.split.train] == tracks[0]]
+    middle = np.median(frames.images[own], 0) / frames.white
+    np.testing.assert_allclose(pictures.light[0] ** (1 / 2.2), middle, atol=1e-4)
+
+
+def test_it_is_a_model_that_grows_and_draws_views():
+    model = small().build(tiny_moving(), 0)
+    assert isinstance(model, Model | Growing | ViewRenderer | SeesEvents)
+    with pytest.raises(OptionError, match="draws whole views"):
+        model.render(Rays(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1), torch.ones(1)))
+
+
+def test_thresholds_gains_and_offsets_can_be_learned():
+    unknowns = UnknownOptions(thresholds="signs", gains=True, offset=True)
+    model = small(unknowns=unknowns).build(tiny_moving(), 0)
+    assert {"unknowns", "offset"} <= {group.name for group in model.groups()}
+    losses = model.losses(model.draw(STEPS - 1), STEPS - 1)
+    assert {"thresholds", "prior"} <= losses.keys()
+    sum(losses.values()).backward()
+    assert model.unknowns.offset_steps is not None
+    assert model.unknowns.offset_steps.grad.abs() > 0, "a stretch of events tells when it was"
+    model.losses(model.draw(STEPS - 2), STEPS - 2)["blur"].backward()
+    assert model.unknowns.log_gain is not None and model.unknowns.log_gain.grad is not None
+    assert model.unknowns.log_gain.grad.any(), "frames tell how long they were exposed"
+
+
+def test_coloured_events_are_refused():
+    capture = tiny_moving()
+    coloured = replace(capture, events=replace(capture.needed_events, bayer="RGGB"))
+    with pytest.raises(CaptureError, match="grey sensors"):
+        small().build(coloured, 0)
+
+
+def test_a_capture_without_what_is_needed_is_refused():
+    with pytest.raises(CaptureError, match="needs events"):
+        small().build(tiny_moving().without(events=True), 0)
+    with pytest.raises(CaptureError, match="needs frames"):
+        small(DynamicSplat).build(tiny_moving().without(frames=True), 0)
+
+
+def test_resuming_equals_never_having_stopped(tmp_path: Path):
+    recipe, stop_at = small(), 26
+
+    class Dying(DynamicModel):
+        def draw(self, step: int) -> Any:
+            if step == stop_at:
+                raise KeyboardInterrupt
+            return super().draw(step)
+
+    def go(folder: str, build: Any, *, resume: bool = False) -> bytes:
+        options = Options(checkpoint_every=5, resume=resume)
+        train(build, tmp_path / folder, options, steps=STEPS, settings={}, console=quiet())
+        return file_of(tmp_path / folder, "last").read_bytes()
+
+    straight = go("straight", lambda steps: recipe.build(tiny_moving(), 1))
+    with pytest.raises(KeyboardInterrupt):
+        go("stopped", lambda steps: Dying(recipe, tiny_moving(), 1))
+    assert go("stopped", lambda steps: recipe.build(tiny_moving(), 1), resume=True) == straight

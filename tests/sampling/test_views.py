@@ -1,0 +1,307 @@
+"""What the steps of a splat recipe look at."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError
+from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
+from sharpfield.events.latent_frames import Belief
+from sharpfield.events.ramps import LONGEST_US, phase_at
+from sharpfield.sampling.views import LookOptions, Looks
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.storage.event_cache import event_index
+
+BELIEF = Belief(0.2, 0.2)
+
+
+@functools.cache
+def coloured(bayer: str = "RGGB") -> Capture:
+    timing = Timing(frames=4, exposure_us=20_000, interval_us=24_000, test_every=4)
+    rig = Rig(size=(16, 12), event_sensor=EventSensor(bayer=bayer))
+    return simulate("tiles", rig=rig, timing=timing, seed=3)
+
+
+@functools.cache
+def busy() -> Capture:
+    """On a mono sensor whose pixels report often."""
+    timing = Timing(frames=4, exposure_us=20_000, interval_us=24_000, test_every=4)
+    rig = Rig(size=(16, 12), event_sensor=EventSensor(threshold_on=0.02, threshold_off=0.02))
+    return simulate("garden", rig=rig, timing=timing, seed=3)
+
+
+def looks(capture: Capture, seed: int = 0, **options) -> Looks:
+    return Looks(LookOptions(**options), capture, seed)
+
+
+def of(batch: Batch) -> tuple[Instants, EventPairs | None]:
+    look, events = batch["look"], batch.get("events")
+    assert isinstance(look, Instants) and (events is None or isinstance(events, EventPairs))
+    return look, events
+
+
+def same(one: Batch, other: Batch) -> bool:
+    return one.keys() == other.keys() and all(
+        torch.equal(getattr(one[name], field), getattr(other[name], field))
+        for name in one
+        for field in ("time", "weight", "value", "xy", "negative", "corner")
+        if hasattr(one[name], field)
+    )
+
+
+@pytest.mark.parametrize("instants", [1, 2, 5])
+def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Capture, instants: int):
+    made = looks(tiny, instants=instants)
+    begin, end = (tiny.clock.unit(int(t)).item() for t in tiny.needed_events.t_us[[0, -1]])
+    for step in range(12):
+        batch = made.exposure(step, events=True, belief=BELIEF)
+        look, _ = of(batch)
+        frames = batch["frames"]
+        assert isinstance(frames, Pixels) and look.shape == (1, instants + 1)
+        assert (look.time.diff() >= 0).all()
+        inside = look.weight > 0
+        assert inside.sum() == instants and look.weight.sum().item() == pytest.approx(1)
+        opens, closes = frames.open.unique().item(), frames.close.unique().item()
+        assert ((look.time >= opens - 1e-6) & (look.time <= closes + 1e-6))[inside].all()
+        beside = look.time[~inside].item()
+        recorded = beside == pytest.approx(begin, abs=1e-6) or beside == pytest.approx(end)
+        assert beside < opens or beside > closes or recorded
+
+
+def test_each_instant_has_a_share_of_the_exposure_of_its_own(tiny: Capture):
+    made = looks(tiny, instants=4)
+    for step in range(8):
+        batch = made.exposure(step, events=False, belief=BELIEF)
+        look, frames = batch["look"], batch["frames"]
+        assert isinstance(look, Instants) and isinstance(frames, Pixels)
+        opens, closes = frames.open.unique(), frames.close.unique()
+        place = (look.time[0] - opens) / (closes - opens)
+        assert (4 * place + 1e-3).floor().tolist() == [0, 1, 2, 3]
+
+
+def test_every_frame_is_looked_at_once_before_any_twice(tiny: Capture):
+    made, train = looks(tiny), tiny.split.train.tolist()
+    for epoch in (0, 3):
+        steps = range(epoch * len(train), (epoch + 1) * len(train))
+        seen = [
+            int(made.exposure(s, events=False, belief=BELIEF)["frames"].frame.unique())
+            for s in steps
+        ]
+        assert sorted(seen) == train
+
+
+def test_frames_are_as_stored(tiny: Capture):
+    made, frames = looks(tiny, blur="none", windows=0.0, sharp=0.0), tiny.needed_frames
+    for step in range(4):
+        batch = made.exposure(step, events=True, belief=BELIEF)
+        look, seen = batch["look"], batch["frames"]
+        assert set(batch) == {"look", "frames"} and isinstance(seen, Pixels)
+        frame = int(seen.frame[0, 0, 0])
+        stored = torch.from_numpy(frames.images[frame] / np.float32(255))
+        torch.testing.assert_close(seen.value, stored[None])
+        assert (seen.track == int(frames.track[frame])).all()
+        assert isinstance(look, Instants) and look.shape == (1, 1)
+        middle = tiny.clock.unit(int(frames.exposure.middle_us[frame]))
+        assert look.time.item() == pytest.approx(float(middle), abs=1e-6)
+
+
+def test_views_that_are_only_drawn_fill_the_exposure(tiny: Capture):
+    """Together with those that teach, each has a share of it of its own, and they count alike."""
+    made, taken = looks(tiny, instants=2, draws=3), set()
+    for step in range(12):
+        batch = made.exposure(step, events=False, belief=BELIEF)
+        look, rest, frames = batch["look"], batch["rest"], batch["frames"]
+        assert isinstance(look, Instants) and isinstance(rest, Instants)
+        assert isinstance(frames, Pixels)
+        opens, closes = frames.open.unique(), frames.close.unique()
+        learned, drawn = (
+            (6 * (seen.time[0] - opens) / (closes - opens) + 1e-3).floor().int().tolist()
+            for seen in (look, rest)
+        )
+        assert sorted(learned + drawn) == list(range(6))
+        assert learned[0] < 3 <= learned[1]
+        taken.update(learned)
+        assert look.weight.tolist() == [[0.5] * 2]
+        assert rest.weight.numpy() == pytest.approx(np.full((1, 4), 1 / 6))
+    assert taken == set(range(6)), "each teaches at some time"
+
+
+def phase(capture: Capture, x: int, y: int, t_us: int) -> float | None:
+    """The part of an event that a pixel saw since its last one; None where nobody knows."""
+    whole = capture.needed_events
+    here = (whole.x == x) & (whole.y == y)
+    before, after = (
+        np.flatnonzero(here & (whole.t_us <= t_us)),
+        np.flatnonzero(here & (whole.t_us > t_us)),
+    )
+    if not len(before) or not len(after):
+        return None
+    last, following = before[-1], after[0]
+    gap = whole.t_us[following] - whole.t_us[last]
+    if whole.p[last] != whole.p[following] or gap > LONGEST_US:
+        return None
+    return float(whole.p[last] * (t_us - whole.t_us[last]) / gap)
+
+
+def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
+    capture, known = busy(), 0
+    made, whole = looks(capture), capture.needed_events
+    index = event_index(whole)
+    for batch in (made.exposure(3, events=True, belief=BELIEF), made.stretch(5)):
+        look, events = of(batch)
+        assert events is not None and events.shape == (1, look.shape[1] - 1, 12, 16, 1)
+        t_us = capture.clock.us(look.time[0].double().numpy())
+        for w, (start, end) in enumerate(zip(t_us[:-1], t_us[1:], strict=True)):
+            for x, y in ((7, 4), (3, 9), (12, 2), (9, 6)):
+                pixel = events[0, w, y, x, 0]
+                here = (whole.x == x) & (whole.y == y)
+                p = whole.p[here & (whole.t_us > start) & (whole.t_us <= end)]
+                ends = [phase(capture, x, y, int(t)) for t in (start, end)]
+                known += sum(part is not None for part in ends)
+                likely = [
+                    float(phase_at(index, int(t), width=16, height=12)[0][y, x])
+                    for t in (start, end)
+                ]
+                parts = [
+                    guess if part is None else part
+                    for part, guess in zip(ends, likely, strict=True)
+                ]
+                brighter = (p > 0).sum() + max(parts[1], 0) - max(parts[0], 0)
+                darker = -(p < 0).sum() + min(parts[1], 0) - min(parts[0], 0)
+                assert pixel.positive.item() == pytest.approx(brighter, abs=1e-3)
+                assert pixel.negative.item() == pytest.approx(darker, abs=1e-3)
+                assert pixel.slack == 0.5 * ends.count(None)
+                assert pixel.xy.tolist() == [x + 0.5, y + 0.5]
+    assert known > 5
+
+
+def test_windows_follow_each_other_from_instant_to_instant(tiny: Capture):
+    look, events = of(looks(tiny, instants=4).exposure(2, events=True, belief=BELIEF))
+    assert events is not None
+    assert torch.equal(events.start[0, :, 0, 0, 0], look.time[0, :-1])
+    assert torch.equal(events.end[0, :, 0, 0, 0], look.time[0, 1:])
+
+
+def test_stretches_lie_within_the_events_and_are_of_all_lengths(tiny: Capture):
+    made = looks(tiny, shortest_us=1_000, longest_us=30_000)
+    t_us = tiny.needed_events.t_us
+    begin, end = (float(tiny.clock.unit(int(t))) for t in (t_us[0], t_us[-1]))
+    lengths = []
+    for step in range(30):
+        look, _ = of(made.stretch(step))
+        assert not look.weight.any()
+        assert look.time.min() >= begin - 1e-6 and look.time.max() <= end + 1e-6
+        lengths.append(float(look.time[0, -1] - look.time[0, 0]) * tiny.clock.span_us)
+    assert 900 < min(lengths) < 8_000 and 22_000 < max(lengths) < 30_100
+
+
+def test_single_instants_come_from_the_whole_capture(tiny: Capture):
+    made = looks(tiny)
+    exposure, train = tiny.needed_frames.exposure, tiny.split.train
+    opens = tiny.clock.unit(int(exposure.open_us[train].min()))
+    closes = tiny.clock.unit(int(exposure.close_us[train].max()))
+    times = []
+    for step in range(20):
+        batch = made.instant(step, BELIEF)
+        look, sharp = batch["look"], batch["sharp"]
+        assert isinstance(look, Instants) and isinstance(sharp, Pixels)
+        assert sharp.shape == (1, 16, 16, 1) and look.weight.tolist() == [[1.0]]
+        assert sharp.open.unique() == look.time
+        wanted = made.sharp.at(int(tiny.clock.us(look.time.double().numpy())[0, 0]), BELIEF)
+        torch.testing.assert_close(sharp.value[0, :, :, 0], wanted, atol=2e-3, rtol=0)
+        times.append(float(look.time))
+    assert opens <= min(times) and max(times) <= closes and max(times) - min(times) > 0.6
+
+
+@pytest.mark.parametrize("part", [5, 16, 99])
+def test_parts_cut_everything_alike(tiny: Capture, part: int):
+    side = min(part, 16)
+    alone, cut = looks(tiny, part=part, sharp=0.0), looks(tiny, part=part)
+    corners = set()
+    for step in range(12):
+        for name, made in (("frames", alone), ("sharp", cut), ("events", cut)):
+            found = made.exposure(step, events=True, belief=BELIEF)
+            look, seen = found["look"], found[name]
+            assert isinstance(look, Instants) and look.size == (side, side)
+            left, top = look.corner[0, 0].tolist()
+            corners.add((left, top))
+            xy = {
+                "frames": seen.xy[0],
+                "sharp": seen.xy[0, :, :, 1],
+                "events": seen.xy[0, 1, ..., 0, :],
+            }[name]
+            assert xy.shape[:2] == (side, side)
+            assert xy[0, 0].tolist() == [left + 0.5, top + 0.5]
+            assert xy[-1, -1].tolist() == [left + side - 0.5, top + side - 0.5]
+            if name == "frames":
+                full = tiny.needed_frames.images[int(seen.frame[0, 0, 0])] / np.float32(255)
+                wanted = torch.from_numpy(full[top : top + side, left : left + side])
+                torch.testing.assert_close(seen.value[0], wanted)
+    assert len(corners) > 5 if side < 16 else corners == {(0, 0)}
+    if side == 16:
+        whole = looks(tiny).exposure(3, events=True, belief=BELIEF)
+        assert same(whole, cut.exposure(3, events=True, belief=BELIEF))
+
+
+def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
+    def drawn(made: Looks, step: int) -> list[Batch]:
+        return [
+            made.instant(step, BELIEF),
+            made.exposure(step, events=True, belief=BELIEF),
+            made.stretch(step),
+        ]
+
+    first, again, other = looks(tiny, 7), looks(tiny, 7), looks(tiny, 8)
+    drawn(again, 1)  # what was looked at before does not matter
+    for one, two, three, later in zip(
+        drawn(first, 5), drawn(again, 5), drawn(other, 5), drawn(first, 6), strict=True
+    ):
+        assert same(one, two) and not same(one, three) and not same(one, later)
+
+
+def test_behind_a_colour_filter_every_pixel_has_three_measurements():
+    made = looks(coloured(), instants=2)
+    _, events = of(made.exposure(1, events=True, belief=BELIEF))
+    assert events is not None and events.shape == (1, 2, 12, 16, 3)
+    assert events.channel is not None and events.channel[0, 1, 5, 6].tolist() == [0, 1, 2]
+    moved = events.positive - events.negative
+    seen = [float(moved[..., colour].sum()) for colour in range(3)]
+    assert len(set(seen)) == 3, "each colour has events of its own"
+    sharp = made.instant(0, BELIEF)["sharp"]
+    assert isinstance(sharp, Pixels) and sharp.value.shape == (1, 12, 16, 1, 3)
+
+
+def test_sharp_pictures_follow_what_is_believed(tiny: Capture):
+    made = looks(tiny)
+    usual, *others = (
+        made.instant(4, belief)["sharp"]
+        for belief in (BELIEF, Belief(0.2, 0.2, 5_000), Belief(0.3, 0.3), BELIEF)
+    )
+    assert [torch.equal(usual.value, other.value) for other in others] == [False, False, True]
+    assert all(torch.equal(usual.open, other.open) for other in others)
+
+
+def test_photos_of_unknown_motion_have_no_sharp_pictures(tiny: Capture):
+    unknown = replace(tiny, notes={**tiny.notes, "motion": "unknown"})
+    assert looks(tiny).sharp is not None and looks(unknown).sharp is None
+
+
+def test_a_frame_of_no_length_is_one_view(tiny: Capture):
+    sharp = replace(tiny, split=replace(tiny.split, train=tiny.split.test, test=tiny.split.train))
+    batch = looks(sharp, instants=5, windows=0.0, sharp=0.0).exposure(
+        0, events=False, belief=BELIEF
+    )
+    assert batch["look"].shape == (1, 1)
+
+
+def test_what_cannot_be_learned_from_is_refused(tiny: Capture):
+    with pytest.raises(CaptureError, match="learns from frames"):
+        looks(tiny.without(frames=True), windows=0.0)
+    held_out = replace(tiny, split=replace(tiny.split, train=tiny.split.train[:0]))
+    with pytest.raises(CaptureError, match="no frame is left to learn from"):
+        looks(held_out)
