@@ -2,7 +2,7 @@
 
     python benchmarks/event_simulator.py
 
-Pictures of a DAVIS346's size at 1000 per second are drawn first and do not count. Each contender
+Images of a DAVIS346's size at 1000 per second are drawn first and do not count. Each contender
 runs in a process of its own, so that peaks do not mix; times are CPU seconds, best of five. Linux
 only, for the peak. Counts differ by some 2 %: a flat colour that comes back leaves a pixel exactly
 on a threshold, and rounding decides.
@@ -21,13 +21,13 @@ from sharpfield.simulation.sensors.event_pixels import LUMA, SENSORS, EventSenso
 from sharpfield.simulation.sensors.events import EventPixels
 from sharpfield.simulation.simulate import Rig, view
 
-SIZE, PICTURES, RUNS = (346, 260), 200, 5
+SIZE, IMAGES, RUNS = (346, 260), 200, 5
 MS = 1_000_000
 
 
 def draw(file: Path) -> None:
     place, path, camera = scene("tiles"), motion("glide", 0), Rig(SIZE).camera()
-    poses = path.poses(np.arange(PICTURES, dtype=np.int64) * 1000)
+    poses = path.poses(np.arange(IMAGES, dtype=np.int64) * 1000)
     np.save(file, np.stack([view(place, camera, pose)[0] @ LUMA for pose in poses]))
 
 
@@ -56,11 +56,11 @@ def plain_numpy(light: np.ndarray, theta: float = 0.2) -> int:
 
 def ours(light: np.ndarray, sensor: EventSensor) -> int:
     pixels = EventPixels(sensor, 0)
-    return sum(len(pixels.see(picture, k * MS).t_us) for k, picture in enumerate(light))
+    return sum(len(pixels.see(image, k * MS).t_us) for k, image in enumerate(light))
 
 
 def measure(name: str, file: Path) -> tuple[int, float, float]:
-    """Events, seconds, and MB of peak memory above what the pictures and libraries take."""
+    """Events, seconds, and MB of peak memory above what the images and libraries take."""
     light = np.load(file)
 
     def run() -> int:
@@ -83,8 +83,8 @@ def peak_mb() -> float:
 
 
 def main() -> None:
-    print(f"{PICTURES} pictures of {SIZE[0]}x{SIZE[1]}, 1 ms apart, threshold 0.2; one core")
-    print(f"{'':24}{'events':>10}{'Mev/s':>8}{'pictures/s':>12}{'peak MB':>9}")
+    print(f"{IMAGES} images of {SIZE[0]}x{SIZE[1]}, 1 ms apart, threshold 0.2; one core")
+    print(f"{'':24}{'events':>10}{'Mev/s':>8}{'images/s':>12}{'peak MB':>9}")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "light.npy"
         draw(file)
@@ -95,8 +95,8 @@ def main() -> None:
         ):
             with get_context("spawn").Pool(1) as alone:
                 events, seconds, peak = alone.apply(measure, (name, file))
-            rate, pictures = 1e-6 * events / seconds, PICTURES / seconds
-            print(f"{label:24}{events:10,}{rate:8.1f}{pictures:12.0f}{peak:9.1f}")
+            rate, images = 1e-6 * events / seconds, IMAGES / seconds
+            print(f"{label:24}{events:10,}{rate:8.1f}{images:12.0f}{peak:9.1f}")
 
 
 if __name__ == "__main__":

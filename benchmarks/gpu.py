@@ -6,7 +6,7 @@ Milliseconds per step and per 300x200 view by the device's own clock, after a wa
 the most that torch held on the device. The contenders are those of `training_step`; heads compute
 in float32 (without TF32) or bfloat16. A batch that does not fit is halved until it does.
 
-Ops are run on their examples on the processor and on the device; the largest difference of values
+Ops are run on their examples on the CPU and on the device; the largest difference of values
 and gradients is told relative to the largest value.
 """
 
@@ -121,7 +121,7 @@ def values_and_gradients(op: Op[..., Any], device: str) -> Iterator[Tensor]:
 
 
 def agreement() -> list[Row]:
-    """Of each op, the largest relative difference between processor and device."""
+    """Of each op, the largest relative difference between CPU and device."""
     for module in pkgutil.iter_modules(ops.__path__, "sharpfield.ops."):
         importlib.import_module(module.name)
     rows: list[Row] = []

@@ -5,7 +5,7 @@
 Makes a capture in ScanNet's layout, unless it is there from an earlier time: a closed-form hall of
 12 m by 9 m, walked around once, with depth of 2 mm noise and some frames blurred. Then `sharpfield
 train` runs a few steps, is asked to `--resume` for a few more, and points grow in between. Each
-command is a process of its own; seconds are of the processor. Memory is what the process holds of
+command is a process of its own; seconds are of the CPU. Memory is what the process holds of
 its own at the peak; with the pages of mapped files, which the system takes back when it needs them,
 it is `with files`. Linux only.
 """
@@ -61,7 +61,7 @@ WATCHED_S = 0.1
 """From one look at a process's memory to the next."""
 
 Times = dict[str, list[tuple[float, float]]]
-"""When each stage began and ended, in seconds of the processor since the process began."""
+"""When each stage began and ended, in seconds of the CPU since the process began."""
 
 
 def make(folder: Path, frames: int, size: tuple[int, int]) -> None:

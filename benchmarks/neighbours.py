@@ -2,10 +2,10 @@
 
     python -m benchmarks.neighbours [--points 100000 1000000 5000000]
 
-Contenders: our cells with the kernels of the processor, the same cells with their definition in
+Contenders: our cells with the kernels of the CPU, the same cells with their definition in
 plain torch, and scipy's cKDTree. Each looks for the 8 nearest within 4 voxels around 75 000 places
 beside surfaces, a training step's worth; ours also walks 3136 rays of 400 places through the room.
-Seconds are of the processor, on one core; memory is what each adds to a fresh process that holds
+Seconds are of the CPU, on one core; memory is what each adds to a fresh process that holds
 the points, while it prepares and at its peak. Linux only, for the peak.
 """
 

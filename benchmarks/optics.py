@@ -19,7 +19,7 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -81,7 +81,7 @@ def main() -> None:
         native.write(capture, source)
         recipe = recipe_named("ev-splat")()
         recipe = prepared("ev-splat", recipe, "draft", capture=capture, device="cpu")
-        started = Started("ev-splat", recipe, str(source.resolve()), asked.seed)
+        started = RunConfig("ev-splat", recipe, str(source.resolve()), asked.seed)
         options = Options(steps=asked.steps)
         start(started, capture, run, options, device="cpu", console=Console())
         mean = measure(open_run(run, capture=None, device="cpu"), run, Console())["mean"]

@@ -15,12 +15,12 @@ from rich.console import Console
 from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.read import read
-from sharpfield.captures.summary import shrunk
+from sharpfield.captures.summary import downscaled
 from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run, start
 from sharpfield.training.plan import Options
 
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/photos"))
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    capture = shrunk(read(asked.scene), asked.shrink)
+    capture = downscaled(read(asked.scene), asked.shrink)
     folder = asked.out / "capture"
     native.write(capture, folder)
     rows: list[Row] = []
@@ -46,7 +46,7 @@ def main() -> None:
         recipe = prepared(
             name, recipe_named(name)(), "draft", capture=native.read(folder), device="cpu"
         )
-        started = Started(name, recipe, str(folder.resolve()), asked.seed)
+        started = RunConfig(name, recipe, str(folder.resolve()), asked.seed)
         options = Options(minutes=asked.minutes)
         start(started, native.read(folder), run, options, device="cpu", console=Console())
         rows.append(_row(name, run))

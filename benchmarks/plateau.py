@@ -21,7 +21,7 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.cameras.rigs import ring
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -65,7 +65,7 @@ def round_of(name: str, minutes: float, capture: Path, run: Path, device: str) -
     """Train for a time and score the result."""
     race, console, seen = RACES[name], Console(), native.read(capture)
     recipe = prepared(name, recipe_named(name)(), "draft", capture=seen, device=device)
-    started = Started(name, recipe, str(capture.resolve()), 0, use=race.use)
+    started = RunConfig(name, recipe, str(capture.resolve()), 0, use=race.use)
     start(started, seen, run, Options(minutes=minutes), device=device, console=console)
     mean = measure(open_run(run, device=device), run, console)["mean"]
     trained = json.loads((run / "training.json").read_text())

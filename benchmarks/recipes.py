@@ -3,7 +3,7 @@
     python -m benchmarks.recipes [--capture FOLDER] [--minutes 15] [--only ev-splat ...]
 
 Without a capture one is simulated: 300x200 px, 26 frames. `splat, sharp frames` learns from the
-true pictures in the middle of each exposure, which no camera could take: what perfect deblurring
+true images in the middle of each exposure, which no camera could take: what perfect deblurring
 of every single frame would give.
 """
 
@@ -23,7 +23,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -38,7 +38,7 @@ class Contender:
     recipe: str
     preset: str = "draft"
     sharp: bool = False
-    """It is given the true sharp pictures of the training frames."""
+    """It is given the true sharp images of the training frames."""
 
 
 CONTENDERS = (
@@ -61,7 +61,7 @@ def simulated(size: str, sensor: str, seed: int) -> Capture:
 def with_true_frames(capture: Capture) -> Capture:
     """The capture as a camera without motion blur would have taken it."""
     frames = capture.needed_frames
-    assert frames.truth is not None, f"{capture.name} knows no sharp pictures"
+    assert frames.truth is not None, f"{capture.name} knows no sharp images"
     images = np.array(frames.images)
     train = capture.split.train
     truth = frames.truth[train]
@@ -120,7 +120,7 @@ def _compete(
         capture=native.read(source),
         device=asked.device,
     )
-    started = Started(contender.recipe, recipe, str(source.resolve()), asked.seed)
+    started = RunConfig(contender.recipe, recipe, str(source.resolve()), asked.seed)
     options = Options(minutes=asked.minutes)
     start(started, native.read(source), run, options, device=asked.device, console=console)
     opened = open_run(run, capture=None, device=asked.device)

@@ -26,7 +26,7 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -116,7 +116,7 @@ def main() -> None:
             "ev-splat", recipe_named("ev-splat")(), preset, capture=capture, device="cpu"
         )
         recipe = replace(recipe, unknowns=replace(recipe.unknowns, threshold=GUESS))
-        started = Started("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
+        started = RunConfig("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
         start(started, capture, run, options, device="cpu", console=console)
         opened = open_run(run, capture=None, device="cpu")
         metrics = measure(opened, run, console)

@@ -30,7 +30,7 @@ def main() -> None:
     capture = captured(options.capture)
     camera = capture.camera.scaled(options.width / capture.camera.width)
     rows: list[Row] = []
-    pictures = []
+    images = []
     for contender in (PLAIN, *OURS):
         model, _ = built(contender, capture, 1)
         path = model.frames.pinhole.trajectory
@@ -40,13 +40,13 @@ def main() -> None:
             start = clock()
             view = render_view(model.render, camera, pose, 0.5)
             seconds.append(clock() - start)
-        pictures.append(view.rgb)
+        images.append(view.rgb)
         rows.append(
             {
                 "contender": contender.name,
                 "s": min(seconds),
                 "s ratio": rows[0]["s"] / min(seconds) if rows else 1.0,
-                "largest difference": (view.rgb - pictures[0]).abs().max().item(),
+                "largest difference": (view.rgb - images[0]).abs().max().item(),
             }
         )
     show(rows)

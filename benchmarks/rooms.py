@@ -24,7 +24,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.evaluation.evaluate import Measuring
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.simulate_room import ROOM_RIG, RoomTiming, simulate_room
 from sharpfield.training.plan import Options
@@ -112,7 +112,7 @@ def _compete(
         name, recipe_named(name)(), contender.preset, capture=capture, device=asked.device
     )
     recipe = changed(recipe, contender.changes)
-    started = Started(name, recipe, str(source.resolve()), asked.seed)
+    started = RunConfig(name, recipe, str(source.resolve()), asked.seed)
     options = Options(steps=asked.steps) if asked.steps else Options(minutes=asked.minutes)
     start(started, capture, run, options, device=asked.device, console=console)
     opened = open_run(run, device=asked.device)

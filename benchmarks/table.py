@@ -22,7 +22,7 @@ def machine() -> dict[str, Any]:
     """What a number depends on besides the code, and which code it was."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "cpu": processor(),
+        "cpu": CPU(),
         "cores": os.cpu_count(),
         "load": round(os.getloadavg()[0], 1),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
@@ -31,14 +31,14 @@ def machine() -> dict[str, Any]:
     }
 
 
-def processor() -> str:
-    """The processor's name, as far as the system tells."""
+def CPU() -> str:
+    """The CPU's name, as far as the system tells."""
     info = Path("/proc/cpuinfo")
     if info.exists():
         for line in info.read_text().splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
+    return platform.CPU() or platform.machine()
 
 
 def commit() -> str:

@@ -8,7 +8,7 @@ or one of so many equal parts of it; the volumes are always the paper's. Every c
 process of its own and starts from the same parameters, so that the losses must agree. A batch that
 does not fit in memory is halved until it does.
 
-Seconds are the best of the runs; with `--threads 1` they are processor seconds, which other
+Seconds are the best of the runs; with `--threads 1` they are CPU seconds, which other
 programs on the machine do not disturb. Memory is the most that the process held during a step, less
 what it held before the model was built. Linux only, for the peak.
 """
@@ -200,7 +200,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--capture", type=Path, default=ATELIER)
     options = parser.parse_args()
-    clock = "processor seconds" if options.threads == 1 else "seconds"
+    clock = "CPU seconds" if options.threads == 1 else "seconds"
     print(f"{clock}, {options.threads} thread(s), best of {options.runs}")
     rows: list[Row] = []
     for parts in options.parts:

@@ -3,7 +3,7 @@
     python -m benchmarks.whole_way [--sfm] [--steps N]
 
 A scene is simulated with a noisy sensor and written as AEDAT4, as EVT3 RAW with a (lossless) video,
-as a ROS bag, as DSEC's HDF5 with pictures, and as a text with pictures. Each goes through `ingest`,
+as a ROS bag, as DSEC's HDF5 with images, and as a text with images. Each goes through `ingest`,
 `doctor`, `poses`, `train` and `evaluate`. Poses are attached from a file, or found with `--sfm`.
 """
 
@@ -85,14 +85,14 @@ def written(capture: Capture, folder: Path) -> dict[str, Words]:
         video.write(np.ascontiguousarray(image[..., ::-1]))
     video.release()
     size = ("--size", f"{events.width}x{events.height}")
-    pictures = ("--clock", "same", "--frame-unit", "us")
+    images = ("--clock", "same", "--frame-unit", "us")
     shutter = ("--exposure", f"{EXPOSURE_US}us", "--offset-ms", open_us[0] / 1000)
     return {
         "AEDAT4": (folder / "one.aedat4",),
         "EVT3 and video": (folder / "one.raw", folder / "one.avi", *shutter),
         "ROS bag": (folder / "one.bag",),
-        "DSEC HDF5": (folder / "one.h5", folder / "images", *pictures),
-        "text": (folder / "events.txt", folder / "images", *pictures, *size, "--unit", "us"),
+        "DSEC HDF5": (folder / "one.h5", folder / "images", *images),
+        "text": (folder / "events.txt", folder / "images", *images, *size, "--unit", "us"),
     }
 
 

@@ -43,13 +43,13 @@ def main(
     middle = float(capture.frame_time[frame].mean())
     pose = model.capture.frame_pose(np.array([frame]))[0]
     light = render_view(model.render, capture.camera, pose, middle).rgb
-    learned = eight_bit(model.develop(light).detach().numpy())
+    learned = eight_bit(model.encode(light).detach().numpy())
 
-    pictures = {"blurry": frames.images[frame], "learned": learned, "truth": frames.truth[frame]}
-    values = {name: torch.from_numpy(np.float32(p)) / 255 for name, p in pictures.items()}
+    images = {"blurry": frames.images[frame], "learned": learned, "truth": frames.truth[frame]}
+    values = {name: torch.from_numpy(np.float32(p)) / 255 for name, p in images.items()}
     for name in ("blurry", "learned"):
         print(f"{name:8} PSNR {psnr(values[name], values['truth']):.2f} dB")
-    write_image(out, np.hstack(list(pictures.values())))
+    write_image(out, np.hstack(list(images.values())))
     print(f"wrote {out}")
 
 

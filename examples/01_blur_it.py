@@ -35,18 +35,18 @@ def main(size: tuple[int, int] = (120, 80), out: Path = Path("blur_it.png")) -> 
     frame = torch.full((len(xy),), FRAME)
     whole = Pixels(xy, frame, torch.zeros_like(frame), opened, closed, torch.zeros(len(xy), 3))
 
-    pictures = []
+    images = []
     for part, instants in ((0.0, 1), (0.2, 5), (0.5, 13), (1.0, 25)):
         half = part * (closed - opened) / 2
         seen = replace(whole, open=whole.middle - half, close=whole.middle + half)
         shutter = Shutter(camera, capture.trajectory, instants, tone)
         rays = shutter.expose(seen)  # [b, k], each with a weight of 1/k
         stored = shutter.observe(light_along(rays, place, 1 / camera.fx_px), seen)
-        pictures.append(np.uint8((255 * stored).round()).reshape(frames.images[FRAME].shape))
+        images.append(np.uint8((255 * stored).round()).reshape(frames.images[FRAME].shape))
 
-    apart = np.abs(np.int16(pictures[-1]) - frames.images[FRAME])
+    apart = np.abs(np.int16(images[-1]) - frames.images[FRAME])
     print(f"from the simulated frame: {apart.mean():.2f} of 255 on average, {apart.max()} at most")
-    write_image(out, np.hstack(pictures))
+    write_image(out, np.hstack(images))
     print(f"wrote {out}")
 
 

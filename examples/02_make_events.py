@@ -2,7 +2,7 @@
 
     python examples/02_make_events.py
 
-writes `events.png`: a blurry frame, the sharp picture it should have been, and the events of
+writes `events.png`: a blurry frame, the sharp image it should have been, and the events of
 its exposure (red: brighter, blue: darker). The same capture in one line is
 `sharpfield simulate --out my_capture`.
 """
@@ -32,9 +32,9 @@ np.add.at(change, (during.y, during.x), during.p)
 
 strength = np.clip(np.abs(change) / 4, 0, 1)[..., None]
 colour = np.where(change[..., None] > 0, [220, 40, 40], [40, 70, 210])
-picture = np.uint8(255 - strength * (255 - colour))
+image = np.uint8(255 - strength * (255 - colour))
 
-row = np.hstack([frames.images[chosen], frames.truth[chosen], picture])
+row = np.hstack([frames.images[chosen], frames.truth[chosen], image])
 cv2.imwrite(
     "events.png", cv2.resize(row[..., ::-1], None, fx=2, fy=2, interpolation=cv2.INTER_AREA)
 )

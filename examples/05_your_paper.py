@@ -3,7 +3,7 @@
     python examples/05_your_paper.py
 
 trains it for some seconds. Two lines in your own `pyproject.toml` make it a recipe of the command
-line, with checkpoints, evaluation, report and films:
+line, with checkpoints, evaluation, report and videos:
 
     [project.entry-points."sharpfield.recipes"]
     mean-blur = "my_package.mean_blur:MeanBlur"
@@ -54,7 +54,7 @@ class Model(nn.Module):
         super().__init__()
         self.nerf = nerf = recipe.nerf.build(capture, seed)
         self.draw, self.groups, self.heaviest_step = nerf.draw, nerf.groups, 0
-        self.render, self.develop, self.capture = nerf.render, nerf.develop, nerf.capture
+        self.render, self.encode, self.capture = nerf.render, nerf.encode, nerf.capture
         path, tone = nerf.capture.trajectory, nerf.tone.encode
         self.shutter = Shutter(capture.camera, path, recipe.instants, tone)
 

@@ -81,7 +81,7 @@ def cost(seen: Sequence, opened: int, tried: FixedThresholds) -> float:
 
 
 def main() -> None:
-    """Read, find the threshold, deblur all frames, write pictures and numbers."""
+    """Read, find the threshold, deblur all frames, write images and numbers."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/davis240c"))
@@ -103,18 +103,18 @@ def main() -> None:
             for k in range(len(seen.frames))
         ]
     )
-    for k, picture in enumerate(sharp):
-        write_image(options.out / f"{k:03d}.png", shown(picture))
-    rows = [torch.cat(list(pictures[options.show]), 1) for pictures in (seen.frames, sharp)]
+    for k, image in enumerate(sharp):
+        write_image(options.out / f"{k:03d}.png", shown(image))
+    rows = [torch.cat(list(images[options.show]), 1) for images in (seen.frames, sharp)]
     write_image(options.out / "before_after.png", shown(torch.cat(rows)))
     about = {"threshold": threshold, "open_bins": opened, "disagreement": lowest}
     (options.out / "edi.json").write_text(json.dumps(about, indent=2) + "\n")
     print(json.dumps(about))
 
 
-def shown(picture: Float[Tensor, "h w 1"]) -> UInt8[np.ndarray, "h w 1"]:
+def shown(image: Float[Tensor, "h w 1"]) -> UInt8[np.ndarray, "h w 1"]:
     """As 8 bit, brightened."""
-    return np.rint(picture.clamp(0, 1).numpy() ** GAMMA * 255).astype(np.uint8)
+    return np.rint(image.clamp(0, 1).numpy() ** GAMMA * 255).astype(np.uint8)
 
 
 if __name__ == "__main__":

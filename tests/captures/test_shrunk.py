@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.summary import shrunk
+from sharpfield.captures.summary import downscaled
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -19,7 +19,7 @@ def recorded() -> Capture:
 
 
 def test_pixels_are_means_of_those_they_cover(recorded: Capture) -> None:
-    small = shrunk(recorded, 3).needed_frames
+    small = downscaled(recorded, 3).needed_frames
     assert (small.width, small.height) == (7, 5)
     images = recorded.needed_frames.images
     block = images[1, 3:6, 6:9].reshape(9, -1).mean(0)
@@ -28,7 +28,7 @@ def test_pixels_are_means_of_those_they_cover(recorded: Capture) -> None:
 
 
 def test_directions_stay_the_same(recorded: Capture) -> None:
-    small = shrunk(recorded, 2).camera
+    small = downscaled(recorded, 2).camera
     xy = torch.tensor([[3.0, 2.5], [9.5, 7.0]])
     torch.testing.assert_close(small.direction(xy), recorded.camera.direction(2 * xy))
 
@@ -36,6 +36,6 @@ def test_directions_stay_the_same(recorded: Capture) -> None:
 def test_events_are_refused(recorded: Capture) -> None:
     timing = Timing(frames=2, exposure_us=10_000, interval_us=20_000, test_every=0)
     with pytest.raises(OptionError, match="smaller"):
-        shrunk(simulate("tiles", rig=Rig((22, 16)), timing=timing), 2)
+        downscaled(simulate("tiles", rig=Rig((22, 16)), timing=timing), 2)
     with pytest.raises(OptionError, match="that small"):
-        shrunk(replace(recorded), 40)
+        downscaled(replace(recorded), 40)

@@ -96,7 +96,7 @@ def test_simulate_has_lenses_and_rolling_shutters(
     assert "scenes that stand still" in capsys.readouterr().err
 
 
-def test_deblur_writes_pictures(recorded: Path, tmp_path: Path) -> None:
+def test_deblur_writes_images(recorded: Path, tmp_path: Path) -> None:
     assert run("deblur", recorded, "--out", tmp_path / "sharp") == 0
     assert len(list((tmp_path / "sharp").glob("*.png"))) == 3 + 1  # and the contact sheet
 
@@ -118,10 +118,10 @@ def test_evaluate_can_refine_the_poses_first(trained: Path) -> None:
     assert protocol["pose_refinement"]
 
 
-def test_render_makes_a_film_and_pictures(trained: Path, tmp_path: Path) -> None:
-    assert run("render", trained, "--out", tmp_path / "film.mp4", "--pictures", 3) == 0
-    assert (tmp_path / "film.mp4").stat().st_size > 0
-    words = ("--path", "exposure:1", "--pictures", 2)
+def test_render_makes_a_video_and_images(trained: Path, tmp_path: Path) -> None:
+    assert run("render", trained, "--out", tmp_path / "video.mp4", "--images", 3) == 0
+    assert (tmp_path / "video.mp4").stat().st_size > 0
+    words = ("--path", "exposure:1", "--images", 2)
     assert run("render", trained, "--out", tmp_path / "inside", *words) == 0
     assert len(list((tmp_path / "inside").glob("*.png"))) == 2
 

@@ -53,7 +53,7 @@ def test_a_stream_that_inspect_reads(
     said = capsys.readouterr().out.replace("\n", "")
     assert run("inspect", out, "--json") == 0
     found = json.loads(capsys.readouterr().out)["events"]
-    assert f"{found['count']:,} events" in said and "pictures" in said
+    assert f"{found['count']:,} events" in said and "images" in said
     assert (found["width"], found["height"]) == (16, 12)
     assert kind == "volume" or found["count"] > 100
 

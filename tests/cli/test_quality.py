@@ -25,7 +25,7 @@ def test_a_room_is_walked_through_and_judged(tmp_path, capsys):
     run("quality", room)
     assert "Rank correlation" in capsys.readouterr().out
     run("blur", room / "truth", "--out", tmp_path / "b", "--k", "5", "9", "--probability", "1")
-    assert "9 of 9 pictures were blurred" in capsys.readouterr().out
+    assert "9 of 9 images were blurred" in capsys.readouterr().out
 
 
 def test_a_room_in_the_layout_of_scannet(tmp_path):

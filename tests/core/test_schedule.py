@@ -44,7 +44,7 @@ def test_learning_rate_golden():
 
 
 def test_prior_weight_golden():
-    """Ev-DeblurNeRF: the weight of the sharp pictures from events."""
+    """Ev-DeblurNeRF: the weight of the sharp images from events."""
     at = cosine(0.01, 1e-5, begin=0, until=10_000)
     steps = (0, 1200, 2500, 5000, 7500, 10_000, 29_999)
     wanted = [0.01, 9.64923e-3, 8.536998e-3, 5.005e-3, 1.473002e-3, 1e-5, 1e-5]

@@ -51,7 +51,7 @@ class Sky(nn.Module):
         seen = sky(rays)
         return replace(seen, rgb=self.gain * seen.rgb**self.power)
 
-    def develop(self, light: Tensor) -> Tensor:
+    def encode(self, light: Tensor) -> Tensor:
         return light.clamp(0, 1) ** (1 / 2.2)
 
     def groups(self) -> list[Group]:
@@ -72,10 +72,10 @@ def capture(*, truth: bool = True, test: tuple[int, ...] = (0, 4), events: int =
     middle = np.arange(6) * 160_000 + 100_000
     half = np.where(np.isin(np.arange(6), test), 0, 80_000)
     exposure = Exposure(middle - half, middle + half)
-    sharp = np.stack([_picture(trajectory, int(t)) for t in middle])
+    sharp = np.stack([_image(trajectory, int(t)) for t in middle])
     blurred = np.stack(
         [
-            np.mean([_picture(trajectory, int(t)) for t in np.linspace(m - h, m + h, 5)], 0)
+            np.mean([_image(trajectory, int(t)) for t in np.linspace(m - h, m + h, 5)], 0)
             for m, h in zip(middle, half, strict=True)
         ]
     )
@@ -107,7 +107,7 @@ def random_events(count: int) -> EventStream:
     return streams.random_events(count, size=(40, 32), first_us=0, last_us=1_000_000, seed=5)
 
 
-def _picture(trajectory: Stamped, time_us: int) -> np.ndarray:
+def _image(trajectory: Stamped, time_us: int) -> np.ndarray:
     time = time_us / CLOCK.span_us
     pose = trajectory.pose(torch.tensor(time), torch.tensor(0))
     return render_view(sky, CAMERA, pose, time).rgb.numpy()

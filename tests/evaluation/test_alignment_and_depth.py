@@ -10,19 +10,19 @@ from sharpfield.evaluation.alignment_and_depth import DARK, aligned_psnr, depth_
 CAMERA = Camera(9, 7, 6.0, 6.0, 4.5, 3.5)
 
 
-def picture() -> torch.Tensor:
+def image() -> torch.Tensor:
     return torch.rand(12, 14, 1, generator=torch.Generator().manual_seed(0))
 
 
 def test_gain_and_offset_of_the_logarithm_cost_nothing():
-    truth = picture()
+    truth = image()
     dim = (0.6 * (truth + DARK).log() - 0.4).exp() - DARK
     assert aligned_psnr(dim, truth) == 100
     assert aligned_psnr(truth**2, truth) < 40
 
 
-def test_a_picture_of_one_colour_is_fitted_by_the_mean_logarithm():
-    truth = picture()
+def test_a_image_of_one_colour_is_fitted_by_the_mean_logarithm():
+    truth = image()
     best = (truth + DARK).log().mean().exp() - DARK
     expected = -10 * float((truth - best).square().mean().log10())
     assert aligned_psnr(torch.full_like(truth, 0.3), truth) == pytest.approx(expected, abs=1e-3)

@@ -4,13 +4,13 @@ import torch
 from sharpfield.evaluation.brightness import Brightness, fit_brightness, fit_log_affine
 
 
-def pictures(count: int = 2, channels: int = 3) -> list[torch.Tensor]:
+def images(count: int = 2, channels: int = 3) -> list[torch.Tensor]:
     generator = torch.Generator().manual_seed(1)
     return [0.05 + 0.9 * torch.rand(9, 7, channels, generator=generator) for _ in range(count)]
 
 
-def test_the_line_that_made_the_pictures_is_found_for_each_channel():
-    light = pictures()
+def test_the_line_that_made_the_images_is_found_for_each_channel():
+    light = images()
     gain, offset = torch.tensor([0.5, 1.0, 2.0]), torch.tensor([-0.1, -0.4, 0.0])
     stored = [(gain * one.log() + offset).exp() for one in light]
     found = fit_log_affine(light, stored)
@@ -20,7 +20,7 @@ def test_the_line_that_made_the_pictures_is_found_for_each_channel():
 
 
 def test_numpy_finds_the_same_line_through_noise():
-    light, stored = pictures(2, 1), [one.flip(0) * 0.8 for one in pictures(2, 1)]
+    light, stored = images(2, 1), [one.flip(0) * 0.8 for one in images(2, 1)]
     x = torch.cat([one.flatten() for one in light]).log().numpy()
     y = torch.cat([one.flatten() for one in stored]).log().numpy()
     design = torch.stack([torch.from_numpy(x), torch.ones(len(x))], -1)
@@ -44,8 +44,8 @@ def test_black_pixels_stay_finite():
 
 def test_without_alignment_the_model_develops():
     brightness = Brightness(lambda light: light * 2)
-    assert brightness.picture(torch.full((1, 1, 3), 0.4)).tolist() == [[pytest.approx([0.8] * 3)]]
-    assert brightness.picture(torch.full((1, 1, 3), 0.9)).max() == 1
+    assert brightness.image(torch.full((1, 1, 3), 0.4)).tolist() == [[pytest.approx([0.8] * 3)]]
+    assert brightness.image(torch.full((1, 1, 3), 0.9)).max() == 1
     assert brightness.words() is None
 
 

@@ -83,7 +83,7 @@ def test_the_file_is_what_was_returned(tmp_path: Path):
     assert {"protocol", "mean", "views", "train_views", "train"} == metrics.keys()
 
 
-def test_pictures_are_written_and_named(tmp_path: Path):
+def test_images_are_written_and_named(tmp_path: Path):
     whole = capture()
     metrics = evaluate(Sky(whole), whole, tmp_path)
     for view in [*metrics["views"], *metrics["train_views"]["views"]]:

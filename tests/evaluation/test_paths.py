@@ -51,17 +51,17 @@ def around_the_origin(count=12, radius=4.0, height=1.5):
 
 
 @pytest.mark.parametrize("path", ["spiral", "train", "exposure:2"])
-@pytest.mark.parametrize("pictures", [1, 2, 17])
-def test_every_path_gives_poses_and_times(path, pictures):
-    made = camera_path(capture(), path, pictures=pictures)
-    assert len(made) == pictures == len(made.poses)
+@pytest.mark.parametrize("images", [1, 2, 17])
+def test_every_path_gives_poses_and_times(path, images):
+    made = camera_path(capture(), path, images=images)
+    assert len(made) == images == len(made.poses)
     check_poses(made.poses.astype(float))
     assert made.time.min() >= 0 and made.time.max() <= 1
 
 
 def test_the_spiral_stays_among_the_cameras_and_looks_at_one_point():
     poses = facing_forward()
-    made = camera_path(photos(poses), "spiral", pictures=40).poses.astype(float)
+    made = camera_path(photos(poses), "spiral", images=40).poses.astype(float)
     centre = made[:, :, 3] - poses[:, :, 3].mean(0)
     reach = np.percentile(np.abs(poses[:, :, 3] - poses[:, :, 3].mean(0)), 90, axis=0)
     np.testing.assert_allclose(np.abs(centre).max(0), reach, rtol=0.02)
@@ -77,7 +77,7 @@ def test_the_spiral_stays_among_the_cameras_and_looks_at_one_point():
 
 
 def test_cameras_all_around_give_a_circle():
-    made = camera_path(photos(around_the_origin()), "spiral", pictures=30).poses.astype(float)
+    made = camera_path(photos(around_the_origin()), "spiral", images=30).poses.astype(float)
     centre, forward = made[:, :, 3], made[:, :, 2]
     np.testing.assert_allclose(np.hypot(centre[:, 0], centre[:, 2]), 4.0, rtol=1e-5)
     np.testing.assert_allclose(centre[:, 1], -1.5, rtol=1e-5)
@@ -90,7 +90,7 @@ def test_cameras_all_around_give_a_circle():
 
 
 def test_the_recording_is_followed_evenly_in_time():
-    made = camera_path(capture(), "train", pictures=5)
+    made = camera_path(capture(), "train", images=5)
     np.testing.assert_allclose(made.time, [0, 0.25, 0.5, 0.75, 1])
     expected = capture().trajectory.pose(torch.from_numpy(made.time), torch.zeros(5).long())
     np.testing.assert_array_equal(made.poses, expected)
@@ -98,7 +98,7 @@ def test_the_recording_is_followed_evenly_in_time():
 
 def test_photos_are_passed_one_after_another():
     poses = facing_forward(5)
-    made = camera_path(photos(poses), "train", pictures=9)
+    made = camera_path(photos(poses), "train", images=9)
     np.testing.assert_allclose(made.poses[::2], poses, atol=1e-6)
     halfway = (poses[:-1, :, 3] + poses[1:, :, 3]) / 2
     np.testing.assert_allclose(made.poses[1::2, :, 3], halfway, atol=1e-6)
@@ -107,13 +107,13 @@ def test_photos_are_passed_one_after_another():
 def test_held_out_photos_are_not_passed():
     poses = facing_forward(5)
     scene = replace(photos(poses), split=Split(np.array([0, 2, 4]), np.array([1, 3])))
-    made = camera_path(scene, "train", pictures=3)
+    made = camera_path(scene, "train", images=3)
     np.testing.assert_allclose(made.poses, poses[[0, 2, 4]], atol=1e-6)
 
 
 def test_an_exposure_runs_from_open_to_close():
     scene = capture()
-    made = camera_path(scene, "exposure:2", pictures=3)
+    made = camera_path(scene, "exposure:2", images=3)
     open_us, close_us = scene.frames.exposure.open_us[2], scene.frames.exposure.close_us[2]
     np.testing.assert_allclose(made.time[[0, 2]], [open_us / SECOND, close_us / SECOND])
     np.testing.assert_allclose(made.poses[1], scene.frame_pose(np.array([2]))[0], atol=1e-6)
@@ -121,7 +121,7 @@ def test_an_exposure_runs_from_open_to_close():
 
 def test_without_frames_the_trajectory_is_followed():
     for path in ("spiral", "train"):
-        assert len(camera_path(capture().without(frames=True), path, pictures=4)) == 4
+        assert len(camera_path(capture().without(frames=True), path, images=4)) == 4
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def refined():
     return model, start, refine_poses(model, capture(), how=QUICK, start=start)
 
 
-def test_poses_come_back_to_where_the_pictures_were_taken(refined):
+def test_poses_come_back_to_where_the_images_were_taken(refined):
     _, start, found = refined
     for frame, truth in own_poses(capture()).items():
         assert angle(start[frame], truth) > 0.025

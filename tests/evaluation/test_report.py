@@ -78,7 +78,7 @@ def test_a_whole_run_is_told(tmp_path: Path):
     path = write_report(tmp_path, capture(), metrics, STORY)
     assert path == tmp_path / "report.html"
     told = checked(path)
-    # 4 training views of 6 pictures and their baseline, 2 held-out ones of 4, 3 frames, events
+    # 4 training views of 6 images and their baseline, 2 held-out ones of 4, 3 frames, events
     assert len(told.images) == 4 * 6 + 2 * 5 + 3 + 1
     for text in (
         f"{metrics['mean']['psnr']:.2f} dB",
@@ -152,7 +152,7 @@ def test_metrics_from_the_file_make_the_same_page(tmp_path: Path):
     assert write_report(tmp_path, capture(), read, STORY).read_bytes() == first
 
 
-def test_a_page_over_budget_gets_smaller_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_page_over_budget_gets_smaller_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     metrics = evaluate(Sky(capture()), capture(), tmp_path)
     large = write_report(tmp_path, capture(), metrics, STORY).stat().st_size
     monkeypatch.setattr(report, "LOOKS", (Look(40, 90), Look(20, 30)))
@@ -166,7 +166,7 @@ def test_the_slider_can_be_worked_from_the_keyboard():
     assert not re.search(r"https?://", script)
 
 
-def test_pictures_are_shrunk_not_enlarged():
+def test_images_are_shrunk_not_enlarged():
     noise = np.random.default_rng(0).integers(0, 255, (60, 90, 3), np.uint8)
     sizes = [len(embedded(noise, Look(px, 80))) for px in (30, 90, 400)]
     assert sizes[0] < sizes[1] == sizes[2]

@@ -35,7 +35,7 @@ def test_golden_numbers() -> None:
     torch.testing.assert_close(sharp, torch.full_like(sharp, 0.459488695), rtol=0, atol=5e-10)
 
 
-def test_average_of_all_latents_is_the_blurred_picture() -> None:
+def test_average_of_all_latents_is_the_blurred_image() -> None:
     slices = torch.randn(8, 3, 4, 1, generator=generator(0, 0, "slices"), dtype=torch.float64)
     path = edi.path_of_instants(slices)
     blurred = torch.rand(3, 4, 3, generator=generator(0, 0, "blur"), dtype=torch.float64)
@@ -60,7 +60,7 @@ def test_published_slices_count_events_on_inner_borders_twice() -> None:
     torch.testing.assert_close(slices, expected)
 
 
-def test_published_picture_is_the_formula_on_stored_values() -> None:
+def test_published_image_is_the_formula_on_stored_values() -> None:
     thresholds = FixedThresholds(0.2, 0.2)
     times = [50, 250, 350, 450, 650, 750]
     events = events_of(times, [1, -1, 1, 1, 1, -1])
@@ -70,7 +70,7 @@ def test_published_picture_is_the_formula_on_stored_values() -> None:
     torch.testing.assert_close(found[0, 1:], stored[0, 1:])
 
 
-def test_published_picture_is_not_clipped() -> None:
+def test_published_image_is_not_clipped() -> None:
     events = events_of([100] * 9, [1] * 9)
     found = edi.published(torch.full((1, 3, 3), 0.9), events, (0, 800), FixedThresholds(0.2, 0.2))
     assert found.max() > 1

@@ -1,4 +1,4 @@
-"""Sharp pictures at any time, against the light of the simulated scene itself."""
+"""Sharp images at any time, against the light of the simulated scene itself."""
 
 import functools
 from dataclasses import replace
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
-from sharpfield.events.latent_frames import Belief, SharpInstants
+from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
 from sharpfield.simulation.cameras.motion import motion
 from sharpfield.simulation.scenes.static import scene
@@ -18,7 +18,7 @@ from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate, view
 
 THRESHOLD = 0.04
-BELIEF = Belief(THRESHOLD, THRESHOLD)
+BELIEF = SensorEstimate(THRESHOLD, THRESHOLD)
 SENSOR = EventSensor(threshold_on=THRESHOLD, threshold_off=THRESHOLD)
 TIMING = Timing(frames=4, exposure_us=40_000, interval_us=60_000, step_us=500, test_every=0)
 SEED = 1
@@ -35,7 +35,7 @@ def instants(capture: Capture) -> SharpInstants:
 
 
 def at(made: SharpInstants, t_us: int, late_us: int = 0) -> Tensor:
-    return made.at(t_us, Belief(THRESHOLD, THRESHOLD, late_us))
+    return made.at(t_us, SensorEstimate(THRESHOLD, THRESHOLD, late_us))
 
 
 def truth(t_us: int) -> Tensor:
@@ -85,7 +85,7 @@ def test_half_way_both_neighbours_count_alike() -> None:
         only = np.array([frame])
         capture = replace(recorded(), split=replace(recorded().split, train=only))
         alone.append(at(instants(capture), t_us))
-    one, other = (tone_of("gamma2.2").decode(picture).log() for picture in alone)
+    one, other = (tone_of("gamma2.2").decode(image).log() for image in alone)
     mean = tone_of("gamma2.2").encode(((one + other) / 2).exp())
     unclipped = (alone[0] < 1) & (alone[1] < 1)
     assert unclipped.float().mean() > 0.9
@@ -106,13 +106,13 @@ def test_a_late_clock_of_the_events_is_undone(late_us: int, after: int) -> None:
 def test_what_was_believed_before_does_not_matter() -> None:
     made, t_us = instants(recorded()), opens(1) + 10_000
     first = made.at(t_us, BELIEF)
-    other = made.at(t_us, Belief(0.06, 0.02))
+    other = made.at(t_us, SensorEstimate(0.06, 0.02))
     assert off(other, truth(t_us)) > 1.5 * off(first, truth(t_us))
     assert torch.equal(made.at(t_us, BELIEF), first)
-    assert torch.equal(instants(recorded()).at(t_us, Belief(0.06, 0.02)), other)
+    assert torch.equal(instants(recorded()).at(t_us, SensorEstimate(0.06, 0.02)), other)
 
 
-def test_pictures_are_asked_for_between_the_first_and_the_last_exposure() -> None:
+def test_images_are_asked_for_between_the_first_and_the_last_exposure() -> None:
     assert instants(recorded()).span_us == (opens(0), opens(3) + 40_000)
     capture = replace(recorded(), split=replace(recorded().split, train=np.array([2, 1])))
     assert instants(capture).span_us == (opens(1), opens(2) + 40_000)

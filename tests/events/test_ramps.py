@@ -8,7 +8,7 @@ import torch
 
 from sharpfield.core.events import EventStream
 from sharpfield.events.index import EventIndex, build
-from sharpfield.events.latent_frames import Belief, SharpInstants
+from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import OVERSHOOT, RAMP_US, ramp_at, ramped_log_mean
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -77,7 +77,7 @@ def test_an_exposure_of_no_length_has_no_mean() -> None:
     assert (ramped_log_mean(index, (3_000, 3_000), (NEGATIVE, POSITIVE), SIZE) == 0).all()
 
 
-def test_pictures_with_ramps_are_nearer_the_truth() -> None:
+def test_images_with_ramps_are_nearer_the_truth() -> None:
     """Stairs show where things were a moment ago."""
     timing = Timing(frames=3, exposure_us=40_000, interval_us=50_000, step_us=500, test_every=0)
     capture = simulate("tiles", "shaky", rig=Rig((36, 24)), timing=timing, seed=1)
@@ -86,7 +86,7 @@ def test_pictures_with_ramps_are_nearer_the_truth() -> None:
     index, off = event_index(capture.needed_events), []
     for used in (None, index):
         made = SharpInstants(capture, moving, used)
-        found = [made.at(int(t), Belief(0.2, 0.2)) for t in frames.exposure.middle_us]
+        found = [made.at(int(t), SensorEstimate(0.2, 0.2)) for t in frames.exposure.middle_us]
         truth = torch.from_numpy(frames.truth / np.float32(frames.white))
         off.append(float((torch.stack(found) - truth).square().mean()))
     assert off[1] < 0.8 * off[0]

@@ -1,4 +1,4 @@
-"""Features of pictures: the published layout, read without enlarging, merged and mixed."""
+"""Features of images: the published layout, read without enlarging, merged and mixed."""
 
 import torch
 
@@ -18,8 +18,8 @@ def test_maps_are_a_half_a_quarter_and_an_eighth():
 
 
 def test_reading_equals_enlarging_and_taking_the_pixel():
-    pictures = torch.rand(3, 48, 64, 3, dtype=torch.float64)
-    levels = FeatureExtractor(3, seed=0).double()(pictures)
+    images = torch.rand(3, 48, 64, 3, dtype=torch.float64)
+    levels = FeatureExtractor(3, seed=0).double()(images)
     whole = torch.cat(
         [
             torch.nn.functional.interpolate(

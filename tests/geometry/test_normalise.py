@@ -19,8 +19,8 @@ from sharpfield.geometry.normalise import (
 from sharpfield.geometry.space import Similarity, average_pose
 from sharpfield.geometry.trajectory import (
     BSpline,
+    LearnedExposureMotion,
     LearnedKnots,
-    LearnedShake,
     Moved,
     Stamped,
     Still,
@@ -148,7 +148,7 @@ def test_tracks_are_counted():
     [
         lambda path: path,
         lambda path: LearnedKnots(path, knots=4),
-        lambda path: LearnedShake(path, torch.zeros(1), torch.ones(1), knots=4),
+        lambda path: LearnedExposureMotion(path, torch.zeros(1), torch.ones(1), knots=4),
     ],
     ids=["known", "corrected", "shaken"],
 )

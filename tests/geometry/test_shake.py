@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from sharpfield.geometry import se3, spline
-from sharpfield.geometry.trajectory import LearnedShake, Still
+from sharpfield.geometry.trajectory import LearnedExposureMotion, Still
 from tests.geometry.toy import poses, twists
 
 OPENS = torch.tensor([0.0, 0.3, 0.7], dtype=torch.float64)
@@ -17,8 +17,8 @@ def base() -> Still:
     return Still(poses(3, stream="photos").numpy())
 
 
-def shaken(start: Tensor | None = None) -> LearnedShake:
-    return LearnedShake(base(), OPENS, CLOSES, knots=KNOTS, start=start)
+def shaken(start: Tensor | None = None) -> LearnedExposureMotion:
+    return LearnedExposureMotion(base(), OPENS, CLOSES, knots=KNOTS, start=start)
 
 
 def start() -> Tensor:

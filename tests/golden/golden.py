@@ -47,7 +47,7 @@ CASES = [
     ("hybrid", "h-only,draft", "room"),
     ("hybrid", "rooms,draft", "room"),
     ("hybrid", "learned,draft", "room"),
-    ("hybrid", "no-pictures,draft", "room"),
+    ("hybrid", "no-images,draft", "room"),
     ("d-nerf", "draft", "moving"),
     ("evdnerf", "draft", "moving"),
     ("evdnerf", "lego,draft", "moving"),
@@ -86,6 +86,7 @@ def numbers(recipe: str, preset: str, capture: Path, out: Path) -> dict[str, Any
         losses = [float(row["total"]) for row in csv.DictReader(file) if row["total"]]
     count, view = first_view(out)
     mean = json.loads((out / "metrics.json").read_text())["mean"]
+    mean.pop("seconds_per_view", None)
     return {
         "losses": losses,
         "parameters": count,
@@ -94,7 +95,7 @@ def numbers(recipe: str, preset: str, capture: Path, out: Path) -> dict[str, Any
             view.std().item(),
             *view.flatten()[:: view.numel() // 16].tolist(),
         ],
-        "metrics": {name: value for name, value in mean.items() if name != "seconds_per_view"},
+        "metrics": {name: value for name, value in mean.items() if value is not None},
     }
 
 

@@ -91,7 +91,7 @@ def test_a_room_learns_its_depth():
     capture = wall()
     recipe = RoomSplat(steps=8)
     gaussians = replace(recipe.gaussians, budget=300, growth="none")
-    looks = replace(recipe.looks, still=0.0, quality="pictures")
+    looks = replace(recipe.looks, still=0.0, quality="images")
     model = replace(recipe, gaussians=gaussians, looks=looks).build(capture, 0)
     terms = model.losses(model.draw(5), 5)
     assert 0 < float(terms["depth"].detach()) < 0.1

@@ -6,7 +6,7 @@ import torch
 
 from sharpfield.core.seed import generator
 from sharpfield.initialisation.start_points import starting_points
-from tests.recipes.planes import depth_at, pictures
+from tests.recipes.planes import depth_at, images
 
 
 def chance(step: int = 0) -> torch.Generator:
@@ -15,7 +15,7 @@ def chance(step: int = 0) -> torch.Generator:
 
 @pytest.fixture(scope="module")
 def held():
-    return pictures()
+    return images()
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_guessed_depths_are_even_in_their_inverse(held):
     assert counts.sum() == 4000 and counts.min() > 720 and counts.max() < 880
 
 
-def test_points_have_the_colour_of_a_picture_that_shows_them(held, started):
+def test_points_have_the_colour_of_a_image_that_shows_them(held, started):
     least = np.full(2000, np.inf)
     for view in range(len(held)):
         xy, _ = held.project(started.points, view)
@@ -53,8 +53,8 @@ def test_points_have_the_colour_of_a_picture_that_shows_them(held, started):
     assert (least < 1e-3).mean() > 0.9
 
 
-def test_sizes_fill_a_picture(held, started):
-    """A square of the size's width at each point covers the picture once."""
+def test_sizes_fill_a_image(held, started):
+    """A square of the size's width at each point covers the image once."""
     half = starting_points(held, 2000, chance(), size=0.35)
     np.testing.assert_allclose(half.sizes, started.sizes / 2, rtol=1e-6)
     covered = []

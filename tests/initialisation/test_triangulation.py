@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from sharpfield.initialisation.triangulation import choose_pairs, find_features, match, triangulate
-from tests.recipes.planes import CAMERA, FAR_WALL, NEAR_WALL, depth_at, pictures
+from tests.recipes.planes import CAMERA, FAR_WALL, NEAR_WALL, depth_at, images
 
 BENT = replace(CAMERA, lens="brown", distortion=(-0.25, 0.05, 0.002, -0.001, 0.0))
 
 
 @pytest.fixture(scope="module")
 def cloud():
-    return triangulate(pictures())
+    return triangulate(images())
 
 
 def test_points_lie_on_the_walls(cloud):
@@ -23,7 +23,7 @@ def test_points_lie_on_the_walls(cloud):
 
 
 def test_points_project_to_where_they_are_seen(cloud):
-    held = pictures()
+    held = images()
     assert cloud.error_px.max() < 1.5 and np.median(cloud.error_px) < 0.4
     for view in range(len(held)):
         xy, depth = held.project(cloud.points[cloud.seen[view]], view)
@@ -31,8 +31,8 @@ def test_points_project_to_where_they_are_seen(cloud):
     assert cloud.seen.sum(0).min() >= 3
 
 
-def test_colours_are_those_of_the_pictures(cloud):
-    held = pictures()
+def test_colours_are_those_of_the_images(cloud):
+    held = images()
     xy, _ = held.project(cloud.points, 2)
     seen = cloud.seen[2]
     shown = held.look(xy[seen], 2)
@@ -40,13 +40,13 @@ def test_colours_are_those_of_the_pictures(cloud):
 
 
 def test_a_lens_that_bends_lines_changes_nothing():
-    cloud = triangulate(pictures(camera=BENT))
+    cloud = triangulate(images(camera=BENT))
     off = np.abs(cloud.points[:, 2] - depth_at(cloud.points))
     assert len(off) > 60 and np.median(off) < 0.03
 
 
 def test_matches_obey_the_ratio_and_are_mutual():
-    held = pictures()
+    held = images()
     features = find_features(held)
     rows = match(held, features, (0, 2))
     assert len(rows) > 30
@@ -58,14 +58,14 @@ def test_matches_obey_the_ratio_and_are_mutual():
 
 def test_wrong_poses_make_few_points():
     """The traces then lie elsewhere: what is found agrees by chance."""
-    held = pictures()
+    held = images()
     poses = held.poses.copy()
     poses[:, 1, 3] += 0.3 * np.array([0, 1, -1, 2, -2])
     assert len(triangulate(replace(held, poses=poses)).points) < 10
 
 
 def test_pairs_have_parallax_and_look_the_same_way():
-    held = pictures(6)
+    held = images(6)
     pairs = choose_pairs(held)
     assert all(i < j for i, j in pairs) and len(set(pairs)) == len(pairs)
     still = replace(held, poses=np.repeat(held.poses[:1], 6, 0))
@@ -75,14 +75,14 @@ def test_pairs_have_parallax_and_look_the_same_way():
     assert all((i < 3) == (j < 3) for i, j in choose_pairs(replace(held, poses=turned)))
 
 
-def test_two_pictures_are_enough():
-    cloud = triangulate(pictures(2))
+def test_two_images_are_enough():
+    cloud = triangulate(images(2))
     assert len(cloud.points) > 20 and (cloud.seen.sum(0) == 2).all()
     assert np.abs(cloud.points[:, 2] - FAR_WALL).min() < 0.1
 
 
 def test_without_anything_in_common_there_are_no_points():
-    held = pictures()
+    held = images()
     blank = replace(held, light=np.full_like(held.light, 0.5))
     for few in (blank, replace(held, light=held.light[:1], poses=held.poses[:1])):
         cloud = triangulate(few)

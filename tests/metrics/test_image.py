@@ -10,7 +10,7 @@ SSIMS = [ssim, ssim_uniform, ssim_paper]
 
 
 def waves() -> tuple[Tensor, Tensor]:
-    """The closed-form pair of pictures behind the published check values."""
+    """The closed-form pair of images behind the published check values."""
     y, x = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     y, x = y.double(), x.double()
     truth = torch.stack([0.5 + 0.4 * (x / 7 + c).sin() * (y / (9 + c)).cos() for c in range(3)], -1)
@@ -27,7 +27,7 @@ def noisy(channels: int = 3) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("measure", SSIMS)
-def test_a_picture_is_like_itself(measure):
+def test_a_image_is_like_itself(measure):
     _, truth = noisy()
     assert measure(truth, truth).item() == pytest.approx(1)
 
@@ -43,7 +43,7 @@ def test_psnr_of_a_constant_error():
     assert psnr(grey + 0.1, grey).item() == pytest.approx(20, abs=1e-4)
 
 
-def test_psnr_of_equal_pictures_is_infinite():
+def test_psnr_of_equal_images_is_infinite():
     assert psnr(torch.ones(2, 2, 1), torch.ones(2, 2, 1)).isinf()
 
 
@@ -68,7 +68,7 @@ def test_the_definitions_differ():
 @pytest.mark.parametrize("pair", [waves, noisy, lambda: noisy(1)])
 def test_scikit_image_agrees(pair):
     metrics = pytest.importorskip("skimage.metrics")
-    a, b = (picture.double().numpy() for picture in pair())
+    a, b = (one.double().numpy() for image in pair())
     gaussian = metrics.structural_similarity(
         b,
         a,
@@ -88,7 +88,7 @@ def test_scikit_image_agrees(pair):
 
 def test_torchmetrics_agrees():
     image = pytest.importorskip("torchmetrics.functional.image")
-    a, b = (picture.double().permute(2, 0, 1)[None] for picture in noisy())
+    a, b = (one.double().permute(2, 0, 1)[None] for one in noisy())
     # Its mean counts windows that hang over the border (filled by reflection); ours does not.
     _, everywhere = image.structural_similarity_index_measure(
         a, b, data_range=1.0, return_full_image=True
@@ -109,6 +109,6 @@ def test_different_shapes_are_refused(measure, monkeypatch: pytest.MonkeyPatch):
         measure(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
 
 
-def test_a_picture_smaller_than_the_window_is_refused():
+def test_a_image_smaller_than_the_window_is_refused():
     with pytest.raises(ShapeError, match=r"smaller than the window[\s\S]*12x6 pixels, window 7"):
         ssim_paper(torch.zeros(6, 12, 3), torch.zeros(6, 12, 3))

@@ -62,7 +62,7 @@ def alex(tmp_path_factory: pytest.TempPathFactory) -> Lpips:
     return load_lpips(backbone, linear)
 
 
-def test_equal_pictures_have_no_distance_and_order_does_not_matter(alex: Lpips):
+def test_equal_images_have_no_distance_and_order_does_not_matter(alex: Lpips):
     a, b = pair()
     assert alex(a, a).item() == 0
     assert alex(a, b).item() == pytest.approx(alex(b, a).item(), rel=1e-5)
@@ -106,7 +106,7 @@ def test_safetensors_give_the_same_and_hashes_are_kept(tmp_path: Path, alex: Lpi
     assert again.sha256["backbone"] != alex.sha256["backbone"]
 
 
-def test_small_pictures(alex: Lpips):
+def test_small_images(alex: Lpips):
     assert alex(torch.zeros(31, 31, 3), torch.ones(31, 31, 3)) > 0
     with pytest.raises(ShapeError, match=r"at least 31 px a side[\s\S]*40x30"):
         alex(torch.zeros(30, 40, 3), torch.ones(30, 40, 3))

@@ -65,28 +65,26 @@ def test_agreeing_comparisons_are_met_exactly():
 
 
 def test_the_laplacian_is_that_of_a_slow_loop():
-    picture = np.random.default_rng(3).integers(0, 256, (14, 17)).astype(np.uint8)
-    padded = np.pad(picture.astype(float), 3, mode="reflect")
+    image = np.random.default_rng(3).integers(0, 256, (14, 17)).astype(np.uint8)
+    padded = np.pad(image.astype(float), 3, mode="reflect")
     smooth = np.array(
         [[padded[r + 1 : r + 6, c + 1 : c + 6].mean() for c in range(17)] for r in range(14)]
     )
     expected = (
         smooth[:-2, 1:-1] + smooth[2:, 1:-1] + smooth[1:-1, :-2] + smooth[1:-1, 2:]
     ) - 4 * smooth[1:-1, 1:-1]
-    np.testing.assert_allclose(laplacian(picture)[1:-1, 1:-1], expected, atol=1e-3)
+    np.testing.assert_allclose(laplacian(image)[1:-1, 1:-1], expected, atol=1e-3)
 
 
 def test_bending_is_lost_along_the_blur():
-    picture = np.random.default_rng(4).integers(0, 256, (60, 60)).astype(np.uint8)
-    across = cv2.blur(picture, (9, 1))
-    kept = [
-        float(b.var() / a.var()) for a, b in zip(bending(picture), bending(across), strict=True)
-    ]
+    image = np.random.default_rng(4).integers(0, 256, (60, 60)).astype(np.uint8)
+    across = cv2.blur(image, (9, 1))
+    kept = [float(b.var() / a.var()) for a, b in zip(bending(image), bending(across), strict=True)]
     assert kept[0] < 0.3 * kept[1]
 
 
 def test_depth_overlap_finds_the_same_points(walked):
-    """Where two frames show the same, the sharp pictures have the same colour."""
+    """Where two frames show the same, the sharp images have the same colour."""
     size = 640, 480
     both = depth_overlap(walked, 3, 5, size)
     assert 0.2 < both.share < 1
@@ -113,10 +111,10 @@ def test_flow_overlap_follows_a_shift():
 
 
 def test_nothing_in_common_counts_nothing():
-    picture = np.zeros((8, 8), np.float32)
+    image = np.zeros((8, 8), np.float32)
     nowhere = np.zeros((0, 2), np.int64)
     none = Overlap(nowhere, nowhere, 0.0)
-    assert compared(0, 1, [picture, picture], none) == Comparison(0, 1, 0.0, 0.0, 0.0)
+    assert compared(0, 1, [image, image], none) == Comparison(0, 1, 0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +140,7 @@ def test_events_measure_blur_in_pixels(walked):
     assert event_blur(walked, frames=walked.split.test).max() < 0.5, "instants have no blur"
 
 
-@pytest.mark.parametrize("source", ["auto", "pictures"])
+@pytest.mark.parametrize("source", ["auto", "images"])
 def test_weights_are_of_all_frames_and_say_nothing_about_held_out_ones(
     walked, by_depth, by_events, source
 ):
@@ -162,8 +160,8 @@ def test_the_published_way_is_the_chain_of_neighbours(walked):
     np.testing.assert_allclose(dimmer.weights, whole.weights, rtol=0.2)
 
 
-def test_only_a_few_pictures_are_held_at_once(walked):
-    """However long the video: 18 pictures of 640x480 with their responses are 49 MB."""
+def test_only_a_few_images_are_held_at_once(walked):
+    """However long the video: 18 images of 640x480 with their responses are 49 MB."""
     for way in ("reconciled", "published"):
         tracemalloc.start()
         quality(walked, way=way, overlap="depth")

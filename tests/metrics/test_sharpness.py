@@ -11,11 +11,11 @@ def noise(channels: int = 3) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("measure", [laplacian_variance, gradient_energy])
-def test_a_flat_picture_has_no_sharpness_and_blur_lowers_it(measure):
-    picture = noise()
-    blurred = torch.from_numpy(cv2.GaussianBlur(picture.numpy(), (5, 5), 1.0))
+def test_a_flat_image_has_no_sharpness_and_blur_lowers_it(measure):
+    image = noise()
+    blurred = torch.from_numpy(cv2.GaussianBlur(image.numpy(), (5, 5), 1.0))
     assert measure(torch.full((9, 9, 3), 0.3)).item() == pytest.approx(0, abs=1e-12)
-    assert measure(blurred) < 0.5 * measure(picture)
+    assert measure(blurred) < 0.5 * measure(image)
 
 
 @pytest.mark.parametrize("measure", [laplacian_variance, gradient_energy])
@@ -24,9 +24,9 @@ def test_twice_the_contrast_is_four_times_the_energy(measure):
 
 
 def test_opencv_agrees():
-    picture = noise(1)
-    wanted = cv2.Laplacian(picture[..., 0].double().numpy(), cv2.CV_64F)[1:-1, 1:-1].var()
-    assert laplacian_variance(picture).item() == pytest.approx(wanted)
+    image = noise(1)
+    wanted = cv2.Laplacian(image[..., 0].double().numpy(), cv2.CV_64F)[1:-1, 1:-1].var()
+    assert laplacian_variance(image).item() == pytest.approx(wanted)
 
 
 def test_gradient_of_a_ramp_is_its_slope():

@@ -17,7 +17,7 @@ for _module in pkgutil.iter_modules(ops.__path__, "sharpfield.ops."):
 
 OPS = list(registered().values())
 TOLERANCE = {"cpu": 2e-5, "cuda": 1e-3}
-"""Of the largest value, in float32. Graphics cards take short cuts in exponentials."""
+"""Of the largest value, in float32. GPUs take short cuts in exponentials."""
 
 FAST = [(op, device) for op in OPS for device in op.fast()]
 

@@ -1,7 +1,7 @@
 """Drawing by gsplat, with a stand-in of plain torch that has its interface and its conventions.
 
 It tells whether poses, corners, shifts and opacities are handed over rightly; whether gsplat's own
-kernels agree with the definition is tested in `test_parity.py` where there is a graphics card.
+kernels agree with the definition is tested in `test_parity.py` where there is a GPU.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Deblurring a capture brings its pictures nearer to the truth, and says with what thresholds."""
+"""Deblurring a capture brings its images nearer to the truth, and says with what thresholds."""
 
 import json
 from dataclasses import replace
@@ -32,16 +32,16 @@ def capture() -> Capture:
     )
 
 
-def error(pictures: np.ndarray, truth: np.ndarray) -> float:
-    return float(((pictures / 255.0 - truth / 255.0) ** 2).mean())
+def error(images: np.ndarray, truth: np.ndarray) -> float:
+    return float(((images / 255.0 - truth / 255.0) ** 2).mean())
 
 
 @pytest.mark.parametrize("method", ["exact", "joint"])
-def test_pictures_come_nearer_to_the_truth(method: str) -> None:
+def test_images_come_nearer_to_the_truth(method: str) -> None:
     held = capture().needed_frames
     made = deblur(capture(), DeblurOptions(method=method, threshold=THRESHOLD))
-    assert made.pictures.shape == (3, 1, 48, 72, 3) and made.pictures.dtype == np.uint8
-    after = error(made.pictures[:, 0], held.truth[made.frame])
+    assert made.images.shape == (3, 1, 48, 72, 3) and made.images.dtype == np.uint8
+    after = error(made.images[:, 0], held.truth[made.frame])
     assert after < 0.5 * error(held.images[made.frame], held.truth[made.frame])
 
 
@@ -50,7 +50,7 @@ def test_light_is_where_the_integral_holds() -> None:
     held = capture().needed_frames
     errors = {
         method: error(
-            deblur(capture(), DeblurOptions(method=method, threshold=THRESHOLD)).pictures[:, 0],
+            deblur(capture(), DeblurOptions(method=method, threshold=THRESHOLD)).images[:, 0],
             held.truth,
         )
         for method in ("exact", "published")
@@ -93,10 +93,10 @@ def test_several_instants_are_centred_in_equal_parts() -> None:
     exposure = capture().needed_frames.exposure
     made = deblur(capture(), DeblurOptions(instants=5, threshold=THRESHOLD))
     expected = exposure.open_us[0] + 50_000 * (np.arange(5) + 0.5) / 5
-    assert made.pictures.shape[1] == 5
+    assert made.images.shape[1] == 5
     np.testing.assert_array_equal(made.instants_us[0], expected)
     once = deblur(capture(), DeblurOptions(threshold=THRESHOLD))
-    np.testing.assert_array_equal(made.pictures[:, 2], once.pictures[:, 0])
+    np.testing.assert_array_equal(made.images[:, 2], once.images[:, 0])
 
 
 def test_only_frames_to_learn_from_that_are_blurred_are_deblurred() -> None:
@@ -119,16 +119,16 @@ def test_colour_events_move_each_colour_by_itself() -> None:
     )
     held = coloured.needed_frames
     made = deblur(coloured, DeblurOptions(threshold=THRESHOLD))
-    before, after = error(held.images, held.truth), error(made.pictures[:, 0], held.truth)
+    before, after = error(held.images, held.truth), error(made.images[:, 0], held.truth)
     assert after < before
 
 
-def test_folder_holds_pictures_a_sheet_and_numbers(tmp_path: Path) -> None:
+def test_folder_holds_images_a_sheet_and_numbers(tmp_path: Path) -> None:
     made = deblur_to(capture(), tmp_path / "out", DeblurOptions(threshold=THRESHOLD))
     about = json.loads((tmp_path / "out" / "deblur.json").read_text())
-    names = [name for row in about["frames"] for name in row["pictures"]]
-    for name, pictures in zip(names, made.pictures, strict=True):
-        np.testing.assert_array_equal(read_image(tmp_path / "out" / name), pictures[0])
+    names = [name for row in about["frames"] for name in row["images"]]
+    for name, images in zip(names, made.images, strict=True):
+        np.testing.assert_array_equal(read_image(tmp_path / "out" / name), images[0])
     assert about["thresholds"]["negative"] == THRESHOLD and about["thresholds"]["from"] == "given"
     assert about["mean"]["after"]["psnr"] > about["mean"]["before"]["psnr"] + 3
     assert about["mean"]["after"]["edge_density"] < about["mean"]["before"]["edge_density"]
@@ -149,7 +149,7 @@ def test_grey_frames_and_rectified_events() -> None:
     made = deblur(both, DeblurOptions(threshold=THRESHOLD))
     coloured = deblur(capture(), DeblurOptions(threshold=THRESHOLD))
     weights = np.array([0.299, 0.587, 0.114])
-    assert np.abs(made.pictures[..., 0] - coloured.pictures @ weights).mean() < 3
+    assert np.abs(made.images[..., 0] - coloured.images @ weights).mean() < 3
 
 
 def test_capture_without_events_is_refused() -> None:

@@ -22,7 +22,7 @@ from sharpfield.metrics.pose import absolute_error, align
 from sharpfield.preparation.poses import mapping as poses_mapping
 from sharpfield.preparation.poses.external import Mount, attach, known_at
 from sharpfield.preparation.poses.find import PoseOptions, PosesFound, find_poses
-from sharpfield.preparation.poses.images import sharp_pictures
+from sharpfield.preparation.poses.images import sharp_images
 from sharpfield.preparation.poses.path import carried_on
 from sharpfield.preparation.poses.report import as_text, summary
 from sharpfield.simulation.cameras.motion import motion
@@ -55,7 +55,7 @@ def true_poses(times_us: np.ndarray) -> torch.Tensor:
     return fast().trajectory.pose(unit, torch.zeros(len(unit), dtype=torch.int64))
 
 
-def test_all_frames_register_from_deblurred_pictures_where_plain_frames_lose_some() -> None:
+def test_all_frames_register_from_deblurred_images_where_plain_frames_lose_some() -> None:
     assert found().map.registered.all() and found().sharp.source == "edi"
     middle = fast().needed_frames.exposure.middle_us
     error = absolute_error(found().capture.frame_pose(np.arange(7)).double(), true_poses(middle))
@@ -63,9 +63,9 @@ def test_all_frames_register_from_deblurred_pictures_where_plain_frames_lose_som
     assert error.translation < 0.05 * spread
     assert error.rotation_deg < 3
     try:
-        plain = find_poses(unposed(fast()), PoseOptions(pictures="frames")).map.registered
+        plain = find_poses(unposed(fast()), PoseOptions(images="frames")).map.registered
     except CaptureError as error:
-        assert "poses could not be found" in str(error) and "--pictures edi" in error.do
+        assert "poses could not be found" in str(error) and "--images edi" in error.do
     else:
         assert not plain.all()
 
@@ -101,7 +101,7 @@ def test_the_capture_survives_the_disk_and_the_report_says_what_happened(tmp_pat
     np.testing.assert_array_equal(again.points, found().capture.points)
     about = summary(unposed(fast()), found())
     assert json.loads(json.dumps(about))["registered"] == 21
-    assert "21 of 21 pictures have a pose" in as_text(about)
+    assert "21 of 21 images have a pose" in as_text(about)
     assert not about["relief"]["flat"] and "nearly flat" not in as_text(about)
     flat = about | {"relief": {"flat": True, "why": "it is nearly flat", "do": "look elsewhere"}}
     assert "warning: it is nearly flat\n  do     look elsewhere" in as_text(flat)
@@ -194,18 +194,18 @@ def test_a_path_is_carried_on_at_its_speed_and_not_too_far() -> None:
 
 def test_only_events_tell_several_instants_apart() -> None:
     with pytest.raises(OptionError, match="only events tell"):
-        sharp_pictures(fast().without(events=True), "auto", instants=3)
-    made = sharp_pictures(fast(), "edi", instants=2)
+        sharp_images(fast().without(events=True), "auto", instants=3)
+    made = sharp_images(fast(), "edi", instants=2)
     assert len(made) == 14 and (np.diff(made.time_us) > 0).all()
-    assert len(sharp_pictures(fast(), "sharpest")) == 3
+    assert len(sharp_images(fast(), "sharpest")) == 3
 
 
-def test_pictures_without_texture_are_refused_with_a_reason() -> None:
+def test_images_without_texture_are_refused_with_a_reason() -> None:
     pytest.importorskip("pycolmap")
     frames = fast().needed_frames
     grey = replace(frames, images=np.full_like(frames.images, 128))
     with pytest.raises(CaptureError, match="too few features") as caught:
-        find_poses(unposed(replace(fast(), frames=grey)), PoseOptions(pictures="frames"))
+        find_poses(unposed(replace(fast(), frames=grey)), PoseOptions(images="frames"))
     assert "--trajectory" in caught.value.do
 
 
@@ -215,7 +215,7 @@ def test_a_missing_package_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(poses_mapping, "need", absent)
     with pytest.raises(MissingExtra, match=r"finding poses needs the package 'pycolmap'") as caught:
-        find_poses(unposed(fast()), PoseOptions(pictures="frames"))
+        find_poses(unposed(fast()), PoseOptions(images="frames"))
     assert "sharpfield[sfm]" in caught.value.do
 
 

@@ -22,7 +22,7 @@ def pose(angle: float) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward, eye], 1)
 
 
-def picture(camera: Camera, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def image(camera: Camera, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Stored values 0...1 and depth."""
     ray = camera.direction(camera.grid().double()).numpy()
     ray = ray / ray[..., 2:]
@@ -40,7 +40,7 @@ def box(frames: int = 10, size: tuple[int, int] = (24, 18)) -> Capture:
     width, height = size
     camera = Camera(width, height, 0.8 * width, 0.8 * width, width / 2, height / 2)
     poses = np.stack([pose(0.25 * i) for i in range(frames)])
-    seen = [picture(camera, one) for one in poses]
+    seen = [image(camera, one) for one in poses]
     images = np.rint(255 * np.stack([one for one, _ in seen])).astype(np.uint8)
     depth = np.rint(1000 * np.stack([one for _, one in seen])).astype(np.uint16)
     times = 1_000_000 * np.arange(frames, dtype=np.int64)

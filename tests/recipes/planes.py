@@ -1,11 +1,11 @@
-"""Pictures of two textured walls, made ray by ray: the depth of every pixel is known."""
+"""Images of two textured walls, made ray by ray: the depth of every pixel is known."""
 
 import numpy as np
 import torch
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.seed import numpy_generator
-from sharpfield.initialisation.posed_images import Pictures
+from sharpfield.initialisation.posed_images import Images
 
 CAMERA = Camera(120, 90, 110.0, 110.0, 60.0, 45.0)
 NEAR_WALL, FAR_WALL, EDGE = 3.0, 5.0, 0.0
@@ -32,14 +32,14 @@ def depth_at(points: np.ndarray) -> np.ndarray:
     return np.where(np.abs(points[:, 2] - NEAR_WALL) < 1, NEAR_WALL, FAR_WALL)
 
 
-def picture(camera: Camera, pose: np.ndarray) -> np.ndarray:
+def image(camera: Camera, pose: np.ndarray) -> np.ndarray:
     ray = camera.direction(camera.grid().double()).numpy() @ pose[:, :3].T
     hits = [pose[:, 3] + ((z - pose[2, 3]) / ray[..., 2])[..., None] * ray for z in (3.0, 5.0)]
     shown = [texture(*hit[..., :2].transpose(2, 0, 1), layer) for layer, hit in enumerate(hits)]
     return np.where(hits[0][..., 0] < EDGE, *shown)
 
 
-def pictures(count: int = 5, *, camera: Camera = CAMERA) -> Pictures:
+def images(count: int = 5, *, camera: Camera = CAMERA) -> Images:
     """A camera that moves sideways and turns a little."""
     poses = np.zeros((count, 3, 4))
     for i in range(count):
@@ -48,6 +48,6 @@ def pictures(count: int = 5, *, camera: Camera = CAMERA) -> Pictures:
         poses[i, 0, [0, 2]] = turn.cos(), turn.sin()
         poses[i, 2, [0, 2]] = -turn.sin(), turn.cos()
         poses[i, :, 3] = 0.15 * i - 0.3, 0.05 * (i % 2), 0.02 * i
-    values = np.stack([picture(camera, pose) for pose in poses])
+    values = np.stack([image(camera, pose) for pose in poses])
     colours = np.repeat(values[..., None], 3, -1).astype(np.float32)
-    return Pictures(camera, colours, poses, 2.0, 8.0)
+    return Images(camera, colours, poses, 2.0, 8.0)

@@ -46,6 +46,6 @@ def test_events_are_not_needed():
     model = SMALL.build(tiny_moving().without(events=True), 0)
     light = model.render(model.shutter.expose(model.draw(0)["frames"]))
     assert light.rgb.shape == (64, 1, 3)
-    stored = model.develop(light.rgb)
+    stored = model.encode(light.rgb)
     assert bool(((stored >= 0) & (stored <= 1)).all())
     assert torch.isfinite(stored).all()

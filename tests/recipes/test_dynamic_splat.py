@@ -17,7 +17,7 @@ from sharpfield.geometry.normalise import centred
 from sharpfield.initialisation.moving import backdrop, hull_between
 from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.splats.dynamic_model import DynamicModel
-from sharpfield.recipes.splats.learned_calibration import UnknownOptions
+from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.rendering.view import ViewRenderer, render_view
 from sharpfield.storage.event_cache import event_index
 from sharpfield.training.checkpoint import file_of
@@ -150,13 +150,13 @@ def test_moving_ones_start_where_something_moves():
 
 def test_the_backdrop_is_what_cameras_see_most_of_the_time():
     capture, _ = centred(tiny_moving())
-    pictures = backdrop(capture)
+    images = backdrop(capture)
     frames = capture.needed_frames
     tracks = np.unique(frames.track[capture.split.train])
-    assert len(pictures) == len(tracks)
+    assert len(images) == len(tracks)
     own = capture.split.train[frames.track[capture.split.train] == tracks[0]]
     middle = np.median(frames.images[own], 0) / frames.white
-    np.testing.assert_allclose(pictures.light[0] ** (1 / 2.2), middle, atol=1e-4)
+    np.testing.assert_allclose(images.light[0] ** (1 / 2.2), middle, atol=1e-4)
 
 
 def test_it_is_a_model_that_grows_and_draws_views():
@@ -167,7 +167,7 @@ def test_it_is_a_model_that_grows_and_draws_views():
 
 
 def test_thresholds_gains_and_offsets_can_be_learned():
-    unknowns = UnknownOptions(thresholds="signs", gains=True, offset=True)
+    unknowns = LearnedCalibrationOptions(thresholds="signs", gains=True, offset=True)
     model = small(unknowns=unknowns).build(tiny_moving(), 0)
     assert {"unknowns", "offset"} <= {group.name for group in model.groups()}
     losses = model.losses(model.draw(STEPS - 1), STEPS - 1)

@@ -107,7 +107,7 @@ def test_every_field_trains_and_renders(tiny: Capture, kind: str) -> None:
     pose = model.capture.frame_pose(torch.arange(1).numpy())[0]
     seen = render_view(model.render, model.capture.camera, pose, 0.5)
     assert seen.rgb.shape == (16, 16, 3)
-    shown = model.develop(seen.rgb)
+    shown = model.encode(seen.rgb)
     assert bool(((shown >= 0) & (shown <= 1)).all())
 
 

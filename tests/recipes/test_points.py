@@ -54,7 +54,7 @@ RECIPES: dict[str, Callable[[], Any]] = {
     "H": lambda: Hybrid(drawn=PIXELS, blur=BlurOptions(kind="none"), quality="even", **SMALL),
     "Full": lambda: Hybrid(drawn=PATCHES, **SMALL),
     "learned": lambda: Hybrid(
-        drawn=PATCHES, blur=BlurOptions(kind="learned", size=5), quality="pictures", **SMALL
+        drawn=PATCHES, blur=BlurOptions(kind="learned", size=5), quality="images", **SMALL
     ),
     "all ours": lambda: Hybrid(
         drawn=PATCHES,
@@ -149,9 +149,9 @@ PUBLISHED = {
     "scene.field.seeing": 133_376,
     "scene.field.to_density": 257,
     "scene.field.to_feature": 68_992,
-    "pictures.merging": 19_713,
-    "pictures.extractor": 10_290,
-    "pictures.mixing": 8_235,
+    "images.merging": 19_713,
+    "images.extractor": 10_290,
+    "images.mixing": 8_235,
     "head": 387,
 }
 
@@ -185,7 +185,7 @@ def test_published_sources_are_four_neighbours_and_never_the_frame_itself():
 def test_sources_by_pose_leave_the_own_frame_out_while_learning():
     capture = box()
     model = RECIPES["all ours"]().build(capture, 0)
-    sources = model.pictures.sources
+    sources = model.images.sources
     frame = torch.as_tensor(capture.split.train)
     pose = sources.poses[frame]
     chosen = sources.of_rays(frame, pose[:, :, 3], pose[:, :, 2], exclude=True)
@@ -197,7 +197,7 @@ def test_sources_by_pose_leave_the_own_frame_out_while_learning():
 def test_sources_see_what_their_pixels_show_and_nothing_behind_walls():
     capture = box()
     model = RECIPES["all ours"]().build(capture, 0)
-    sources = model.pictures.sources
+    sources = model.images.sources
     frame = 3
     camera, at = capture.camera, sources.poses[frame]
     xy = camera.grid().reshape(-1, 2)

@@ -19,11 +19,11 @@ from sharpfield.formation.mix import mix
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.geometry.trajectory import Still
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.splats.learned_calibration import UnknownOptions
+from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel
 from sharpfield.recipes.splats.scene import GaussianOptions
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
-from sharpfield.sampling.views import LookOptions
+from sharpfield.sampling.views import SamplingOptions
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -121,7 +121,7 @@ def test_every_way_of_growing_learns(growth: str) -> None:
 
 
 def test_everything_unknown_is_learned_at_once() -> None:
-    unknowns = UnknownOptions(
+    unknowns = LearnedCalibrationOptions(
         threshold=(0.12, 0.12), thresholds="pixels", response="residual",
         gains=True, knots=6, offset=True,
     )  # fmt: skip
@@ -134,7 +134,7 @@ def test_everything_unknown_is_learned_at_once() -> None:
 
 
 def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> None:
-    model = small("ev-splat", looks=LookOptions(early=0.5, instants=3)).build(recorded(), 0)
+    model = small("ev-splat", looks=SamplingOptions(early=0.5, instants=3)).build(recorded(), 0)
     assert model.late_from == model.heaviest_step == STEPS // 2
     early, late = model.draw(STEPS // 2 - 1), model.draw(STEPS // 2)
     assert set(early) == {"look", "sharp"} and len(early["look"].time[0]) == 1
@@ -146,7 +146,7 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> Non
 
 
 def test_in_the_end_frames_decide_and_events_no_longer() -> None:
-    model = small("ev-splat", looks=LookOptions(early=0.5, fading=0.1)).build(recorded(), 0)
+    model = small("ev-splat", looks=SamplingOptions(early=0.5, fading=0.1)).build(recorded(), 0)
     batch, settles = model.draw(STEPS - 1), model.scene.last_growth
     before, first, last = (model.losses(batch, step) for step in (STEPS // 2, settles, STEPS))
     for name in ("sharp", "events"):
@@ -159,7 +159,7 @@ def test_in_the_end_frames_decide_and_events_no_longer() -> None:
 
 def test_a_blurred_frame_is_the_mean_of_all_views_with_the_gradient_of_a_few() -> None:
     """Of few views, the error would be that of a frame which was exposed at those few instants."""
-    looks = LookOptions(instants=2, draws=4, early=0.0, sharp=0.0, windows=0.0)
+    looks = SamplingOptions(instants=2, draws=4, early=0.0, sharp=0.0, windows=0.0)
     model = small("ev-splat", looks=looks).build(recorded(), 0)
     batch = model.draw(0)
     look, rest, frames = batch["look"], batch["rest"], batch["frames"]
@@ -209,7 +209,7 @@ def test_it_is_a_model_that_grows_and_draws_views() -> None:
     assert isinstance(model, ViewRenderer) and renderer_of(model) is model
     pose = model.capture.frame_pose(np.array([0]))[0]
     seen = render_view(renderer_of(model), model.capture.camera, pose, 0.5)
-    shown = model.develop(seen.rgb)
+    shown = model.encode(seen.rgb)
     assert shown.shape == (24, 32, 3) and shown.min() >= 0 and shown.max() <= 1
 
 
@@ -250,7 +250,7 @@ def test_a_distorted_lens_is_learned_through(lens: str) -> None:
 def test_a_lens_that_sees_too_wide_is_refused() -> None:
     fish = Camera(32, 24, 9.0, 9.0, 16.0, 12.0, "fisheye", (0.0, 0.0, 0.0, 0.0))
     model = small("splat").build(replace(recorded(), camera=fish), 0)
-    with pytest.raises(OptionError, match="sees too wide for pictures of Gaussians"):
+    with pytest.raises(OptionError, match="sees too wide for images of Gaussians"):
         model.losses(model.draw(0), 0)
 
 
@@ -263,7 +263,7 @@ def rolled() -> Capture:
 
 
 def test_a_rolling_shutter_is_better_modelled_than_not() -> None:
-    """Sharp pictures are more like views whose rows are read late than like those of an instant."""
+    """Sharp images are more like views whose rows are read late than like those of an instant."""
     model = replace(small("ev-splat"), steps=100).build(rolled(), 0)
     fit(model, adam(model), steps=range(100))
     frames = rolled().needed_frames
@@ -277,7 +277,7 @@ def test_a_rolling_shutter_is_better_modelled_than_not() -> None:
             for rows in (late, None)
         ]
         truth = torch.from_numpy(sharp / np.float32(frames.white))
-        off.append([(model.develop(light) - truth).square().mean() for light in seen])
+        off.append([(model.encode(light) - truth).square().mean() for light in seen])
     modelled, ignored = torch.tensor(off).mean(0)
     assert modelled < 0.98 * ignored
 
@@ -312,7 +312,7 @@ def test_the_recipes_are_listed_and_described() -> None:
 
 
 def test_a_step_depends_on_seed_and_step_alone() -> None:
-    recipe = small("ev-splat", unknowns=UnknownOptions(gains=True, knots=4))
+    recipe = small("ev-splat", unknowns=LearnedCalibrationOptions(gains=True, knots=4))
     first, second = recipe.build(recorded(), 5), recipe.build(recorded(), 5)
     first.losses(first.draw(3), 3)  # what was looked at before does not matter
     for step in (2, 20):
@@ -333,7 +333,9 @@ def test_resuming_equals_never_having_stopped(
     tmp_path: Path, name: str, growth: str, source: Any
 ) -> None:
     gaussians = GaussianOptions(budget=600, start=0.5, growth=growth, grow_every=4)
-    unknowns = UnknownOptions(thresholds="signs", gains=True, knots=4, offset=name == "ev-splat")
+    unknowns = LearnedCalibrationOptions(
+        thresholds="signs", gains=True, knots=4, offset=name == "ev-splat"
+    )
     recipe, stop_at = small(name, gaussians=gaussians, unknowns=unknowns), 18
 
     class Dying(SplatModel):
@@ -362,8 +364,8 @@ def test_a_scene_can_be_seen_through_another_lens() -> None:
     large = camera.scaled(3.0)
     seen = render_view(model.through(large), large, pose, 0.5).rgb
     assert seen.shape == (72, 96, 3)
-    shrunk = seen.reshape(24, 3, 32, 3, 3).mean((1, 3))
-    assert (shrunk - own.rgb).abs().mean() < 0.2 * (own.rgb - own.rgb.mean()).abs().mean()
+    downscaled = seen.reshape(24, 3, 32, 3, 3).mean((1, 3))
+    assert (downscaled - own.rgb).abs().mean() < 0.2 * (own.rgb - own.rgb.mean()).abs().mean()
 
 
 def test_events_of_several_cameras_are_refused():

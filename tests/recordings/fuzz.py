@@ -78,7 +78,7 @@ def check(open_function: Open, path: Path, *, case: Case | None = None) -> str:
     """
     per_byte, seconds = (case.most_per_byte, case.seconds) if case else (12.0, 2.0)
     most_memory = _peak() + (case.mebibytes if case else 256.0)
-    begin = time.process_time()  # others may be using the processor, too
+    begin = time.process_time()  # others may be using the CPU, too
     outcome = _read(open_function, path, most=int(per_byte * path.stat().st_size) + 1)
     took = time.process_time() - begin
     assert took < seconds, f"took {took:.1f} s"

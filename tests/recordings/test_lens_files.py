@@ -130,7 +130,7 @@ def test_a_turned_camera_sees_far_points_elsewhere():
         atol=1e-2,
     )
     behind = seen_from(ideal, ideal, np.diag([1.0, -1, -1]))
-    assert (behind < -1000).all(), "what lies behind is not in the picture"
+    assert (behind < -1000).all(), "what lies behind is not in the image"
 
 
 # What cannot be read

@@ -2,7 +2,13 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.open import FORMATS, Told, format_of, open_events, open_recording
+from sharpfield.recordings.open import (
+    FORMATS,
+    ReaderOptions,
+    format_of,
+    open_events,
+    open_recording,
+)
 from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.images import write_image
 from tests.streams import HEIGHT, WIDTH, random_events
@@ -53,13 +59,13 @@ from tests.streams import HEIGHT, WIDTH, random_events
 def test_every_sample_is_recognised_by_what_is_in_it(samples, name, layout, told, count, span):
     path = samples / name
     assert format_of(path) == layout
-    found = open_recording(path, Told(**told)).load()
+    found = open_recording(path, ReaderOptions(**told)).load()
     assert count is None or len(found) == count
     assert span is None or found.t_us[-1] - found.t_us[0] == span
 
 
 def test_samples_without_events(samples):
-    assert format_of(samples / "slider_depth_noevents") == "pictures"
+    assert format_of(samples / "slider_depth_noevents") == "images"
     assert format_of(samples / "video" / "vid2e_seq1.mp4") == "video"
 
 
@@ -71,7 +77,7 @@ def test_the_name_of_a_file_is_not_believed(tmp_path):
 
 def test_every_format_says_what_it_takes():
     for name, known in FORMATS.items():
-        assert set(known.takes) <= set(vars(Told())), name
+        assert set(known.takes) <= set(vars(ReaderOptions())), name
         assert known.holds and known.marks, name
 
 
@@ -101,7 +107,7 @@ def test_what_fits_several_formats(tmp_path):
 def test_what_does_not_belong_to_the_format(tmp_path):
     write_events(tmp_path / "e.h5", random_events(5))
     with pytest.raises(OptionError, match="the format hdf5 has no option columns") as caught:
-        open_recording(tmp_path / "e.h5", Told(columns="xytp"))
+        open_recording(tmp_path / "e.h5", ReaderOptions(columns="xytp"))
     assert "it belongs to" in str(caught.value) and "npy" in str(caught.value)
     with pytest.raises(OptionError, match="unknown format"):
         open_recording(tmp_path / "e.h5", layout="evt9")

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.chunks import CHUNK, Piece, joined, known_size
-from sharpfield.recordings.recording import Recording, Trouble
+from sharpfield.recordings.chunks import CHUNK, RawChunk, joined, known_size
+from sharpfield.recordings.recording import ReadLog, Recording
 
 SIZE = (12, 10)
 
 
-def piece(t_us: list[int] | np.ndarray, x: object = 0) -> Piece:
+def piece(t_us: list[int] | np.ndarray, x: object = 0) -> RawChunk:
     count = len(t_us)
-    return Piece(
+    return RawChunk(
         np.broadcast_to(np.asarray(x, np.uint16), count),
         np.zeros(count, np.uint16),
         np.asarray(t_us, np.int64),
@@ -25,7 +25,7 @@ def test_chunks_are_the_same_for_pieces_of_any_length(length: int) -> None:
     count = min(2 * CHUNK + 1000, 2000 * length + 1)
     t_us = np.arange(count)
     pieces = (piece(t_us[i : i + length]) for i in range(0, count, length))
-    trouble = Trouble()
+    trouble = ReadLog()
     chunks = list(joined(pieces, SIZE, where="a", trouble=trouble))
     np.testing.assert_array_equal(np.concatenate([chunk.t_us for chunk in chunks]), t_us)
     assert all(CHUNK // 2 <= len(chunk) <= CHUNK for chunk in chunks[:-1])
@@ -34,15 +34,15 @@ def test_chunks_are_the_same_for_pieces_of_any_length(length: int) -> None:
 
 
 def test_no_pieces_are_no_chunks() -> None:
-    assert not list(joined(iter([piece([])]), SIZE, where="a", trouble=Trouble()))
+    assert not list(joined(iter([piece([])]), SIZE, where="a", trouble=ReadLog()))
     empty = Recording(
-        Path("a"), "test", SIZE, lambda: joined(iter([]), SIZE, where="", trouble=Trouble())
+        Path("a"), "test", SIZE, lambda: joined(iter([]), SIZE, where="", trouble=ReadLog())
     )
     assert len(empty.load()) == 0
 
 
 def test_what_cannot_be_is_dropped_and_counted() -> None:
-    trouble = Trouble()
+    trouble = ReadLog()
     pieces = [piece([1, 2, 3, 4], [0, 12, 11, 65535]), piece([2, 3, 9, 8, 9])]
     (chunk,) = joined(iter(pieces), SIZE, where="a", trouble=trouble)
     assert chunk.t_us.tolist() == [1, 3, 3, 9, 9]
@@ -52,7 +52,7 @@ def test_what_cannot_be_is_dropped_and_counted() -> None:
 def test_few_late_events_are_dropped_but_no_more() -> None:
     t_us = np.arange(100_000)
     t_us[500:1000:5] -= 50
-    trouble = Trouble()
+    trouble = ReadLog()
     (chunk,) = joined(iter([piece(t_us)]), SIZE, where="a", trouble=trouble)
     assert len(chunk) == 99_900 and (np.diff(chunk.t_us) >= 0).all()
 
@@ -60,7 +60,7 @@ def test_few_late_events_are_dropped_but_no_more() -> None:
 def test_events_that_are_not_in_order_are_refused() -> None:
     pieces = [piece(np.arange(1000)), piece(np.arange(500, 1000))]
     with pytest.raises(CaptureError) as refused:
-        list(joined(iter(pieces), SIZE, where="a.raw", trouble=Trouble()))
+        list(joined(iter(pieces), SIZE, where="a.raw", trouble=ReadLog()))
     assert str(refused.value) == (
         "CaptureError: event times are not ascending\n"
         "  where  a.raw\n"
@@ -72,14 +72,14 @@ def test_events_that_are_not_in_order_are_refused() -> None:
 def test_most_events_outside_the_sensor_are_an_error() -> None:
     x = np.where(np.arange(1000) < 600, 40, 3)
     with pytest.raises(CaptureError) as refused:
-        list(joined(iter([piece(np.arange(1000), x)]), SIZE, where="a.raw", trouble=Trouble()))
+        list(joined(iter([piece(np.arange(1000), x)]), SIZE, where="a.raw", trouble=ReadLog()))
     assert str(refused.value) == (
         "CaptureError: most events lie outside the sensor\n"
         "  where  a.raw\n"
         "  got    600 of 1,000, x up to 40 and y up to 0, of 12 x 10 pixels\n"
         "  do     check the size of the sensor, and which column is which"
     )
-    trouble = Trouble()
+    trouble = ReadLog()
     x = np.where(np.arange(1000) < 400, 40, 3)
     (chunk,) = joined(iter([piece(np.arange(1000), x)]), SIZE, where="a.raw", trouble=trouble)
     assert len(chunk) == 600 and str(trouble) == "400 events outside the sensor"

@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.recordings.open import FORMATS, Told, open_recording
-from sharpfield.recordings.recording import Recording, Trouble
+from sharpfield.recordings.open import FORMATS, ReaderOptions, open_recording
+from sharpfield.recordings.recording import ReadLog, Recording
 from sharpfield.storage.images import write_image
 from tests.recordings import fuzz
 from tests.recordings.aedat import test_aedat2, test_aedat3, test_aedat4
@@ -51,11 +51,11 @@ def torn(case: str, layout: str) -> Make:
 
 def text(folder: Path) -> Recording:
     (folder / "events.txt").write_text(rpg_lines(300) + "1.0 2 x 1\n")
-    return open_recording(folder / "events.txt", Told(size=(240, 180)))
+    return open_recording(folder / "events.txt", ReaderOptions(size=(240, 180)))
 
 
 def rpg(folder: Path) -> Recording:
-    return open_recording(text(folder).path.parent, Told(size=(240, 180)))
+    return open_recording(text(folder).path.parent, ReaderOptions(size=(240, 180)))
 
 
 def columns() -> dict[str, np.ndarray]:
@@ -66,24 +66,24 @@ def hdf5(folder: Path) -> Recording:
     with h5py.File(folder / "a.h5", "w") as file:
         for name, column in columns().items():
             file[name] = column
-    return open_recording(folder / "a.h5", Told(size=NARROW, unit="us"))
+    return open_recording(folder / "a.h5", ReaderOptions(size=NARROW, unit="us"))
 
 
 def npz(folder: Path) -> Recording:
     np.savez(folder / "a.npz", **columns())
-    return open_recording(folder / "a.npz", Told(size=NARROW, unit="us"))
+    return open_recording(folder / "a.npz", ReaderOptions(size=NARROW, unit="us"))
 
 
 def npz_folder(folder: Path) -> Recording:
     for i in range(3):
         later = columns() | {"t": EVENTS.t_us + 100_000 * i}
         np.savez(folder / f"{i}.npz", **later)
-    return open_recording(folder, Told(size=NARROW, unit="us"))
+    return open_recording(folder, ReaderOptions(size=NARROW, unit="us"))
 
 
 def npy(folder: Path) -> Recording:
     np.save(folder / "a.npy", np.stack(list(columns().values()), -1))
-    return open_recording(folder / "a.npy", Told(size=NARROW, unit="us", columns="xytp"))
+    return open_recording(folder / "a.npy", ReaderOptions(size=NARROW, unit="us", columns="xytp"))
 
 
 def torn_video(folder: Path) -> Recording:
@@ -94,10 +94,10 @@ def torn_video(folder: Path) -> Recording:
     return open_recording(path)
 
 
-def pictures(folder: Path) -> Recording:
+def images(folder: Path) -> Recording:
     for i in range(3):
         write_image(folder / f"{i}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    return open_recording(folder, Told(per_second=30.0))
+    return open_recording(folder, ReaderOptions(per_second=30.0))
 
 
 MAKE: dict[str, Make] = {
@@ -115,9 +115,9 @@ MAKE: dict[str, Make] = {
     "npz-folder": npz_folder,
     "npy": npy,
     "video": torn_video,
-    "pictures": pictures,
+    "images": images,
 }
-NEVER = ("video", "pictures")
+NEVER = ("video", "images")
 """Formats of which a reading may leave nothing out: it is refused, or ends where decoding ends."""
 
 
@@ -146,7 +146,7 @@ def test_reading_again_tells_the_same(tmp_path: Path, layout: str) -> None:
 
 
 def test_readings_beside_each_other() -> None:
-    trouble = Trouble()
+    trouble = ReadLog()
     trouble.note("odd headers")
     for _ in range(2):
         events, frames = trouble.anew("events"), trouble.anew("frames")

@@ -12,7 +12,7 @@ from sharpfield.storage.images import write_image
 from tests.recordings import fuzz
 
 
-def pictures(folder: Path, count: int = 4) -> Path:
+def images(folder: Path, count: int = 4) -> Path:
     for i in range(count):
         write_image(folder / f"{i:04d}.png", np.full((6, 8, 3), 10 * i, np.uint8))
     return folder
@@ -80,15 +80,15 @@ def test_the_sample_video(samples):
     assert frames[0].image.shape == (260, 346, 3)
 
 
-# Pictures
+# Images
 
 
 def opens(recording) -> list[tuple[int, int]]:
     return [(frame.open_us, frame.close_us) for frame in recording.frames()]
 
 
-def test_pictures_listed_with_seconds(tmp_path):
-    pictures(tmp_path / "images")
+def test_images_listed_with_seconds(tmp_path):
+    images(tmp_path / "images")
     (tmp_path / "images.txt").write_text(
         "".join(f"{0.04 * i:.9f} images/{i:04d}.png\n" for i in (0, 1, 3))
     )
@@ -98,14 +98,14 @@ def test_pictures_listed_with_seconds(tmp_path):
 
 
 def test_exposures_of_two_columns(tmp_path):
-    folder = pictures(tmp_path / "left")
+    folder = images(tmp_path / "left")
     text = "# start_us, end_us\n" + "".join(f"{100 * i}, {100 * i + 30}\n" for i in range(4))
     (tmp_path / "exposure_timestamps_left.txt").write_text(text)
     assert opens(open_images(folder)) == [(100 * i, 100 * i + 30) for i in range(4)]
 
 
 def test_starts_and_ends_in_two_files(tmp_path):
-    folder = pictures(tmp_path / "Blur", 2)
+    folder = images(tmp_path / "Blur", 2)
     (tmp_path / "Exposure_start.txt").write_text("1615008142416409\n1615008142538749\n")
     (tmp_path / "Exposure_end.txt").write_text("1615008142520408\n1615008142642749\n")
     with pytest.raises(CaptureError, match="in which unit") as caught:
@@ -115,21 +115,21 @@ def test_starts_and_ends_in_two_files(tmp_path):
 
 
 def test_timestamps_in_arrays(tmp_path):
-    folder = pictures(tmp_path / "images_1")
+    folder = images(tmp_path / "images_1")
     start = np.arange(4) * 1000
     np.savez(folder / "timestamps.npz", timestamps_start=start, timestamps_end=start + 500)
     assert opens(open_images(folder, unit="ns")) == [(0, 1), (1, 2), (2, 3), (3, 4)]
 
 
 def test_a_rate(tmp_path):
-    assert opens(open_images(pictures(tmp_path / "p"), per_second=30.0))[3][0] == 100_000
+    assert opens(open_images(images(tmp_path / "p"), per_second=30.0))[3][0] == 100_000
     with pytest.raises(OptionError, match="between 0 and a million"):
         open_images(tmp_path / "p", per_second=0.0)
 
 
 def test_what_is_missing_is_asked_for(tmp_path):
-    folder = pictures(tmp_path / "p")
-    with pytest.raises(CaptureError, match="nothing says when the pictures were taken"):
+    folder = images(tmp_path / "p")
+    with pytest.raises(CaptureError, match="nothing says when the images were taken"):
         open_images(folder)
     for name in ("timestamps_a.txt", "timestamps_b.txt"):
         (folder / name).write_text("1\n2\n3\n4\n")
@@ -141,9 +141,9 @@ def test_what_is_missing_is_asked_for(tmp_path):
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
-    folder = pictures(tmp_path / "p")
+    folder = images(tmp_path / "p")
     (folder / "timestamps.txt").write_text("1\n2\n3\n")
-    with pytest.raises(CaptureError, match="one time for each picture"):
+    with pytest.raises(CaptureError, match="one time for each image"):
         open_images(folder, unit="us")
     (folder / "timestamps.txt").write_text("1\n2\nsoon\n4\n")
     with pytest.raises(CaptureError, match="cannot read a time"):
@@ -152,5 +152,5 @@ def test_what_does_not_fit_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="lies outside the recording"):
         open_images(tmp_path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CaptureError, match="no pictures found"):
+    with pytest.raises(CaptureError, match="no images found"):
         open_images(tmp_path / "empty", per_second=1.0)

@@ -52,7 +52,7 @@ def views(pose: Tensor, weight: Tensor | None = None) -> Views:
 
 
 class Model:
-    """Draws views, and the same rays one by one through a picture of each pose."""
+    """Draws views, and the same rays one by one through a image of each pose."""
 
     def __init__(self, draw: Splatting, scene: Cloud) -> None:
         self.splatting, self.scene = draw, scene
@@ -151,7 +151,7 @@ class Swing:
 
 
 def test_both_engines_report_the_same_blur():
-    """Rays through `Shutter`, looked up in pictures of each instant; and views, through `mix`."""
+    """Rays through `Shutter`, looked up in images of each instant; and views, through `mix`."""
     scene, draw, instants = cloud(), splatting(), 4
     shutter = Shutter(CAMERA, Swing(), instants, TONE.encode)
     seen = replace(pixels(9), open=torch.full((9,), 0.2), close=torch.full((9,), 0.8))
@@ -159,15 +159,15 @@ def test_both_engines_report_the_same_blur():
     rays = shutter.expose(replace(seen, xy=xy))
 
     pose = Swing().pose(rays.time[:1], torch.zeros(1, instants, dtype=torch.int64))
-    pictures = draw(scene, views(pose, rays.weight[:1]))
-    found = mix(pictures, outer=TONE.encode)[0]
+    images = draw(scene, views(pose, rays.weight[:1]))
+    found = mix(images, outer=TONE.encode)[0]
 
     def looked_up(rays: Rays) -> Radiance:
-        """What a renderer of rays would see: each ray in the picture of its own instant."""
+        """What a renderer of rays would see: each ray in the image of its own instant."""
         inside = se3.rotate(se3.inverse(pose.expand(9, instants, 3, 4)), rays.direction)
         x, y = CAMERA.project(inside).floor().long().unbind(-1)
         k = torch.arange(instants).expand(9, instants)
-        return replace(pictures[0, y, x, k], weight=rays.weight)
+        return replace(images[0, y, x, k], weight=rays.weight)
 
     torch.testing.assert_close(rays.origin, pose[:, :, :, 3].expand(9, instants, 3))
     wanted = shutter.observe(looked_up(rays), seen)

@@ -52,7 +52,7 @@ def test_a_dot_is_where_the_lens_shows_it(lens: str, xy: tuple[float, float]):
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_wall_has_its_own_depth_and_light_everywhere(lens: str):
-    """No pixel looks past the edge of the flat picture, and depth stays that along the axis."""
+    """No pixel looks past the edge of the flat image, and depth stays that along the axis."""
     camera, colour = LENSES[lens], torch.tensor([[0.2, 0.5, 0.9]])
     wall = Gaussians.start(torch.tensor([[0.0, 0.0, 4.0]]), colour, torch.ones(1), opacity=0.9999)
     wall.log_scales.data = torch.tensor([[200.0, 200.0, 1e-3]]).log()
@@ -71,8 +71,8 @@ def test_a_lens_that_bends_nothing_changes_next_to_nothing():
     assert (straight - bent).abs().max() < 1e-4
 
 
-def test_it_is_like_a_fine_picture_looked_up_ray_by_ray():
-    """Oracle: a pinhole picture of eight times as many pixels, at the nearest of them."""
+def test_it_is_like_a_fine_image_looked_up_ray_by_ray():
+    """Oracle: a pinhole image of eight times as many pixels, at the nearest of them."""
     made = torch.Generator().manual_seed(1)
     points = torch.randn(60, 3, generator=made) * torch.tensor([1.2, 0.9, 0.3])
     cloud = dots(points + torch.tensor([0.0, 0.0, 3.0]), 0.25)
@@ -99,7 +99,7 @@ def test_a_whole_image_is_its_parts(lens: str):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_the_flat_picture_is_as_fine_as_the_lens(lens: str):
+def test_the_flat_image_is_as_fine_as_the_lens(lens: str):
     """Neighbouring pixels are at least a flat pixel apart, or about, and all lie inside."""
     flat = flattened(LENSES[lens])
     where = flat.where
@@ -109,7 +109,7 @@ def test_the_flat_picture_is_as_fine_as_the_lens(lens: str):
     assert flattened(LENSES[lens]) is flat
 
 
-def test_where_a_lens_sees_very_wide_pictures_are_coarser():
+def test_where_a_lens_sees_very_wide_images_are_coarser():
     wide = Camera(60, 44, 28.0, 28.0, 30.0, 22.0, "fisheye", (0.0, 0.0, 0.0, 0.0))
     flat = flattened(wide).camera
     assert flat.fx_px < wide.fx_px and flat.width * flat.height < 4.4 * 60 * 44
@@ -151,7 +151,7 @@ def test_a_pose_learned_through_a_lens_goes_the_right_way():
 
 
 def test_looking_up_is_exact_for_planes_and_differentiable():
-    """Bilinear interpolation leaves linear pictures as they are."""
+    """Bilinear interpolation leaves linear images as they are."""
     y, x = torch.meshgrid(torch.arange(5.0) + 0.5, torch.arange(7.0) + 0.5, indexing="ij")
     plane = (2 * x + 3 * y)[None].double().requires_grad_()
     drawn = Drawn(plane[..., None], -plane, plane / 100)

@@ -41,7 +41,7 @@ def test_frames_of_windows_add_up_to_the_stream():
 
 
 def test_few_events_are_left_out_by_the_frames_own_largest_count():
-    """The released pictures keep 3 of 10 and 2 of 6, and drop 2 of 7 and 1 of 6."""
+    """The released images keep 3 of 10 and 2 of 6, and drop 2 of 7 and 1 of 6."""
     frames = np.array(
         [[[10, -3, 2, 0]], [[-7, 2, 3, -2]], [[6, 2, -1, -2]], [[0, 0, 0, 0]]], np.int32
     )
@@ -52,15 +52,15 @@ def test_few_events_are_left_out_by_the_frames_own_largest_count():
     np.testing.assert_array_equal(without_few(frames, 0.0), frames)
 
 
-def test_a_folder_holds_arrays_pictures_and_a_film(tmp_path):
+def test_a_folder_holds_arrays_images_and_a_video(tmp_path):
     counts = frames_of(random_events(20_000), windows(0, 1_000_000, 250_000))
     for _ in range(2):  # the second takes the place of the first
         write_frames(tmp_path / "frames", counts, least_share=0.5)
     np.testing.assert_array_equal(np.load(tmp_path / "frames" / "counts.npy"), counts)
     frames = np.load(tmp_path / "frames" / "frames.npy")
     np.testing.assert_array_equal(frames, without_few(signed(np.stack(counts)), 0.5))
-    picture = read_image(tmp_path / "frames" / "0003.png").astype(int)
-    red, blue = (picture[..., a] > picture[..., b] for a, b in ((0, 2), (2, 0)))
+    image = read_image(tmp_path / "frames" / "0003.png").astype(int)
+    red, blue = (image[..., a] > image[..., b] for a, b in ((0, 2), (2, 0)))
     np.testing.assert_array_equal(red, frames[3] > 0)
     np.testing.assert_array_equal(blue, frames[3] < 0)
     assert (tmp_path / "frames" / "frames.mp4").stat().st_size > 0

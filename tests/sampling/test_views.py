@@ -10,14 +10,14 @@ import torch
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
-from sharpfield.events.latent_frames import Belief
+from sharpfield.events.latent_frames import SensorEstimate
 from sharpfield.events.ramps import LONGEST_US, phase_at
-from sharpfield.sampling.views import LookOptions, Looks
+from sharpfield.sampling.views import SamplingOptions, ViewSampler
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.event_cache import event_index
 
-BELIEF = Belief(0.2, 0.2)
+BELIEF = SensorEstimate(0.2, 0.2)
 
 
 @functools.cache
@@ -35,8 +35,8 @@ def busy() -> Capture:
     return simulate("garden", rig=rig, timing=timing, seed=3)
 
 
-def looks(capture: Capture, seed: int = 0, **options) -> Looks:
-    return Looks(LookOptions(**options), capture, seed)
+def looks(capture: Capture, seed: int = 0, **options) -> ViewSampler:
+    return ViewSampler(SamplingOptions(**options), capture, seed)
 
 
 def of(batch: Batch) -> tuple[Instants, EventPairs | None]:
@@ -59,7 +59,7 @@ def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Captur
     made = looks(tiny, instants=instants)
     begin, end = (tiny.clock.unit(int(t)).item() for t in tiny.needed_events.t_us[[0, -1]])
     for step in range(12):
-        batch = made.exposure(step, events=True, belief=BELIEF)
+        batch = made.exposure(step, events=True, sensor_estimate=BELIEF)
         look, _ = of(batch)
         frames = batch["frames"]
         assert isinstance(frames, Pixels) and look.shape == (1, instants + 1)
@@ -76,7 +76,7 @@ def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Captur
 def test_each_instant_has_a_share_of_the_exposure_of_its_own(tiny: Capture):
     made = looks(tiny, instants=4)
     for step in range(8):
-        batch = made.exposure(step, events=False, belief=BELIEF)
+        batch = made.exposure(step, events=False, sensor_estimate=BELIEF)
         look, frames = batch["look"], batch["frames"]
         assert isinstance(look, Instants) and isinstance(frames, Pixels)
         opens, closes = frames.open.unique(), frames.close.unique()
@@ -89,7 +89,7 @@ def test_every_frame_is_looked_at_once_before_any_twice(tiny: Capture):
     for epoch in (0, 3):
         steps = range(epoch * len(train), (epoch + 1) * len(train))
         seen = [
-            int(made.exposure(s, events=False, belief=BELIEF)["frames"].frame.unique())
+            int(made.exposure(s, events=False, sensor_estimate=BELIEF)["frames"].frame.unique())
             for s in steps
         ]
         assert sorted(seen) == train
@@ -98,7 +98,7 @@ def test_every_frame_is_looked_at_once_before_any_twice(tiny: Capture):
 def test_frames_are_as_stored(tiny: Capture):
     made, frames = looks(tiny, blur="none", windows=0.0, sharp=0.0), tiny.needed_frames
     for step in range(4):
-        batch = made.exposure(step, events=True, belief=BELIEF)
+        batch = made.exposure(step, events=True, sensor_estimate=BELIEF)
         look, seen = batch["look"], batch["frames"]
         assert set(batch) == {"look", "frames"} and isinstance(seen, Pixels)
         frame = int(seen.frame[0, 0, 0])
@@ -114,7 +114,7 @@ def test_views_that_are_only_drawn_fill_the_exposure(tiny: Capture):
     """Together with those that teach, each has a share of it of its own, and they count alike."""
     made, taken = looks(tiny, instants=2, draws=3), set()
     for step in range(12):
-        batch = made.exposure(step, events=False, belief=BELIEF)
+        batch = made.exposure(step, events=False, sensor_estimate=BELIEF)
         look, rest, frames = batch["look"], batch["rest"], batch["frames"]
         assert isinstance(look, Instants) and isinstance(rest, Instants)
         assert isinstance(frames, Pixels)
@@ -152,7 +152,7 @@ def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
     capture, known = busy(), 0
     made, whole = looks(capture), capture.needed_events
     index = event_index(whole)
-    for batch in (made.exposure(3, events=True, belief=BELIEF), made.stretch(5)):
+    for batch in (made.exposure(3, events=True, sensor_estimate=BELIEF), made.stretch(5)):
         look, events = of(batch)
         assert events is not None and events.shape == (1, look.shape[1] - 1, 12, 16, 1)
         t_us = capture.clock.us(look.time[0].double().numpy())
@@ -181,7 +181,7 @@ def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
 
 
 def test_windows_follow_each_other_from_instant_to_instant(tiny: Capture):
-    look, events = of(looks(tiny, instants=4).exposure(2, events=True, belief=BELIEF))
+    look, events = of(looks(tiny, instants=4).exposure(2, events=True, sensor_estimate=BELIEF))
     assert events is not None
     assert torch.equal(events.start[0, :, 0, 0, 0], look.time[0, :-1])
     assert torch.equal(events.end[0, :, 0, 0, 0], look.time[0, 1:])
@@ -225,7 +225,7 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
     corners = set()
     for step in range(12):
         for name, made in (("frames", alone), ("sharp", cut), ("events", cut)):
-            found = made.exposure(step, events=True, belief=BELIEF)
+            found = made.exposure(step, events=True, sensor_estimate=BELIEF)
             look, seen = found["look"], found[name]
             assert isinstance(look, Instants) and look.size == (side, side)
             left, top = look.corner[0, 0].tolist()
@@ -244,15 +244,15 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
                 torch.testing.assert_close(seen.value[0], wanted)
     assert len(corners) > 5 if side < 16 else corners == {(0, 0)}
     if side == 16:
-        whole = looks(tiny).exposure(3, events=True, belief=BELIEF)
-        assert same(whole, cut.exposure(3, events=True, belief=BELIEF))
+        whole = looks(tiny).exposure(3, events=True, sensor_estimate=BELIEF)
+        assert same(whole, cut.exposure(3, events=True, sensor_estimate=BELIEF))
 
 
 def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
-    def drawn(made: Looks, step: int) -> list[Batch]:
+    def drawn(made: ViewSampler, step: int) -> list[Batch]:
         return [
             made.instant(step, BELIEF),
-            made.exposure(step, events=True, belief=BELIEF),
+            made.exposure(step, events=True, sensor_estimate=BELIEF),
             made.stretch(step),
         ]
 
@@ -266,7 +266,7 @@ def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
 
 def test_behind_a_colour_filter_every_pixel_has_three_measurements():
     made = looks(coloured(), instants=2)
-    _, events = of(made.exposure(1, events=True, belief=BELIEF))
+    _, events = of(made.exposure(1, events=True, sensor_estimate=BELIEF))
     assert events is not None and events.shape == (1, 2, 12, 16, 3)
     assert events.channel is not None and events.channel[0, 1, 5, 6].tolist() == [0, 1, 2]
     moved = events.positive - events.negative
@@ -276,17 +276,22 @@ def test_behind_a_colour_filter_every_pixel_has_three_measurements():
     assert isinstance(sharp, Pixels) and sharp.value.shape == (1, 12, 16, 1, 3)
 
 
-def test_sharp_pictures_follow_what_is_believed(tiny: Capture):
+def test_sharp_images_follow_what_is_believed(tiny: Capture):
     made = looks(tiny)
     usual, *others = (
-        made.instant(4, belief)["sharp"]
-        for belief in (BELIEF, Belief(0.2, 0.2, 5_000), Belief(0.3, 0.3), BELIEF)
+        made.instant(4, sensor_estimate)["sharp"]
+        for sensor_estimate in (
+            BELIEF,
+            SensorEstimate(0.2, 0.2, 5_000),
+            SensorEstimate(0.3, 0.3),
+            BELIEF,
+        )
     )
     assert [torch.equal(usual.value, other.value) for other in others] == [False, False, True]
     assert all(torch.equal(usual.open, other.open) for other in others)
 
 
-def test_photos_of_unknown_motion_have_no_sharp_pictures(tiny: Capture):
+def test_photos_of_unknown_motion_have_no_sharp_images(tiny: Capture):
     unknown = replace(tiny, notes={**tiny.notes, "motion": "unknown"})
     assert looks(tiny).sharp is not None and looks(unknown).sharp is None
 
@@ -294,7 +299,7 @@ def test_photos_of_unknown_motion_have_no_sharp_pictures(tiny: Capture):
 def test_a_frame_of_no_length_is_one_view(tiny: Capture):
     sharp = replace(tiny, split=replace(tiny.split, train=tiny.split.test, test=tiny.split.train))
     batch = looks(sharp, instants=5, windows=0.0, sharp=0.0).exposure(
-        0, events=False, belief=BELIEF
+        0, events=False, sensor_estimate=BELIEF
     )
     assert batch["look"].shape == (1, 1)
 

@@ -8,16 +8,16 @@ from sharpfield.simulation.sensors.event_pixels import EventSensor
 
 
 def ramp(count: int) -> np.ndarray:
-    """Pictures that grow brighter, display values; left faster than right."""
+    """Images that grow brighter, display values; left faster than right."""
     value = 60 + np.arange(count)[:, None] * np.array([9.0, 6, 3, 1])
     return np.broadcast_to(value[:, None, :, None], (count, 6, 4, 3)).astype(np.uint8)
 
 
 @pytest.fixture
 def folder(tmp_path):
-    for i, picture in enumerate(ramp(12)):
-        cv2.imwrite(str(tmp_path / f"{i:03d}.png"), picture)
-    (tmp_path / "notes.txt").write_text("not a picture")
+    for i, image in enumerate(ramp(12)):
+        cv2.imwrite(str(tmp_path / f"{i:03d}.png"), image)
+    (tmp_path / "notes.txt").write_text("not a image")
     return tmp_path
 
 
@@ -62,24 +62,20 @@ def test_a_video_becomes_frames_and_events(tmp_path):
 
 
 def test_bad_footage_says_so(folder, tmp_path):
-    with pytest.raises(CaptureError, match="no pictures found"):
+    with pytest.raises(CaptureError, match="no images found"):
         folder_footage(tmp_path / "nowhere", per_second=10.0)
-    with pytest.raises(OptionError, match="either the rate of the pictures or their times"):
+    with pytest.raises(OptionError, match="either the rate of the images or their times"):
         folder_footage(folder)
-    with pytest.raises(
-        CaptureError, match="one time for each picture.*\n.*\n  got    12 pictures, 3"
-    ):
+    with pytest.raises(CaptureError, match="one time for each image.*\n.*\n  got    12 images, 3"):
         folder_footage(folder, times_us=np.arange(3))
     with pytest.raises(CaptureError, match="not a video that can be decoded"):
         video_footage(folder / "notes.txt")
     with pytest.raises(
-        OptionError, match="grouped like this\n.*\n  got    12 pictures in groups of 13"
+        OptionError, match="grouped like this\n.*\n  got    12 images in groups of 13"
     ):
         simulate_footage(folder_footage(folder, per_second=10.0), group=13)
     cv2.imwrite(str(folder / "999.png"), np.zeros((5, 5, 3), np.uint8))
-    with pytest.raises(
-        CaptureError, match="different sizes\n  where  .*, picture 12\n  got    5x5"
-    ):
+    with pytest.raises(CaptureError, match="different sizes\n  where  .*, image 12\n  got    5x5"):
         simulate_footage(folder_footage(folder, per_second=10.0), group=2)
-    with pytest.raises(CaptureError, match="times of pictures must ascend"):
+    with pytest.raises(CaptureError, match="times of images must ascend"):
         Footage("x", np.array([0, 5, 5]), lambda: iter(()))

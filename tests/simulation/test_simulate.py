@@ -9,7 +9,7 @@ from sharpfield.simulation.cameras.motion import Motion, motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import LUMA, EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, pictures, simulate, view
+from sharpfield.simulation.simulate import Rig, Timing, images, simulate, view
 
 RIG = Rig((48, 32))
 SHORT = Timing(frames=9, exposure_us=20_000, interval_us=25_000, step_us=2500)
@@ -55,11 +55,11 @@ def test_a_still_camera_sees_sharp_frames_and_no_events():
 
 
 def test_blur_is_there_and_linear(capture):
-    """A blurry frame is the mean of linear pictures, not of displayed ones."""
+    """A blurry frame is the mean of linear images, not of displayed ones."""
     frames = capture.needed_frames
     shown = [
         rgb
-        for t_us, rgb in pictures(scene("tiles"), motion("glide", 4), capture.camera, SHORT)
+        for t_us, rgb in images(scene("tiles"), motion("glide", 4), capture.camera, SHORT)
         if frames.exposure.open_us[5] <= t_us <= frames.exposure.close_us[5]
     ]
     light = np.stack(shown).astype(float)
@@ -95,11 +95,11 @@ def test_a_seed_is_a_capture(capture):
     np.testing.assert_array_equal(again.needed_events.t_us, capture.needed_events.t_us)
 
 
-def test_finer_watching_adds_pictures_where_light_changes():
+def test_finer_watching_adds_images_where_light_changes():
     few = Timing(frames=1, exposure_us=20_000, step_us=10_000, test_every=0)
     camera, place, path = RIG.camera(), scene("tiles"), motion("glide", 0)
-    even = [t for t, _ in pictures(place, path, camera, few)]
-    fine = [t for t, _ in pictures(place, path, camera, replace(few, most_change=0.7))]
+    even = [t for t, _ in images(place, path, camera, few)]
+    fine = [t for t, _ in images(place, path, camera, replace(few, most_change=0.7))]
     assert even == [0, 10_000, 20_000, 30_000, 40_000] and set(even) < set(fine)
 
 

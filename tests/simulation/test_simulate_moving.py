@@ -10,7 +10,7 @@ from sharpfield.events.index import build
 from sharpfield.geometry.trajectory import Still, Tracks, count_tracks
 from sharpfield.simulation.cameras.rigs import (
     RING_FOCAL,
-    Standing,
+    StillCamera,
     Views,
     hand_held,
     ring,
@@ -35,17 +35,15 @@ def capture():
 def test_scenes_are_within_their_bounds_and_move(name):
     place, camera = moving_scene(name), RIG.camera()
     for azimuth in (-90, 20, 140):
-        pictures = []
+        images = []
         for time_s in (0.0, 0.21, 0.47, 0.8, 1.0):
             rgb, depth = view(place, camera, ring_pose(azimuth), time_s)
             thing = depth < 1e8
             assert place.near < depth.min() and depth[thing].max() < place.far
             assert 0.1 < thing.mean() < (0.3 if name in ALONE else 0.8)
             assert name not in ALONE or not (thing[[0, -1]].any() or thing[:, [0, -1]].any())
-            pictures.append(rgb)
-        changes = [
-            np.abs(a - b).max(-1) > 0.02 for a, b in zip(pictures, pictures[1:], strict=False)
-        ]
+            images.append(rgb)
+        changes = [np.abs(a - b).max(-1) > 0.02 for a, b in zip(images, images[1:], strict=False)]
         assert all(0.03 < change.mean() < 0.5 for change in changes)
 
 
@@ -125,7 +123,7 @@ def test_the_same_seed_gives_the_same_capture(capture):
 
 
 def test_cameras_of_a_real_sensor_differ():
-    views = Views([Standing(ring_pose(-90))] * 2)
+    views = Views([StillCamera(ring_pose(-90))] * 2)
     rig = replace(RIG, event_sensor=EventSensor(threshold_sigma=0.03))
     made = simulate_moving("spinner", views, rig=rig, timing=SHORT)
     maps = made.notes["threshold_on_map"]

@@ -36,7 +36,7 @@ def test_the_wanted_share_is_blurred_and_held_out_frames_are_sharp(walked):
 
 
 def test_frames_are_the_mean_of_light_while_the_shutter_is_open(walked):
-    """The blurriest frame, against many pictures of its exposure."""
+    """The blurriest frame, against many images of its exposure."""
     frame = int(np.argmax(walked.notes["blur_px"]))
     times = np.linspace(*walked.frames.exposure.window(frame), 60).round().astype(np.int64)
     path, place = walk(walked.clock.span_us, 1), room()
@@ -114,8 +114,8 @@ def test_an_exposure_blurs_the_share_that_was_asked_for(blurry, expected):
 
 def test_instants_hold_both_ends_and_the_middle():
     exposure = Exposure(np.array([100, 500]), np.array([301, 500]))
-    np.testing.assert_array_equal(instants(exposure, 0, pictures=3), [100, 200, 301])
-    np.testing.assert_array_equal(instants(exposure, 1, pictures=9), [500])
+    np.testing.assert_array_equal(instants(exposure, 0, images=3), [100, 200, 301])
+    np.testing.assert_array_equal(instants(exposure, 1, images=9), [500])
 
 
 def test_a_cylinder_is_where_geometry_says():

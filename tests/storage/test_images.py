@@ -9,7 +9,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import list_images, read_image, read_images, write_image
 
 
-def picture(dtype=np.uint8, channels=3, size=(4, 6)):
+def made_image(dtype=np.uint8, channels=3, size=(4, 6)):
     high = np.iinfo(dtype).max
     return (
         np.random.default_rng(1).integers(0, high, (*size, channels), endpoint=True).astype(dtype)
@@ -19,7 +19,7 @@ def picture(dtype=np.uint8, channels=3, size=(4, 6)):
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_reading_gives_what_was_written(tmp_path, dtype, channels):
-    image = picture(dtype, channels)
+    image = made_image(dtype, channels)
     write_image(tmp_path / "a.png", image)
     read = read_image(tmp_path / "a.png")
     assert read.dtype == dtype
@@ -33,7 +33,7 @@ def test_red_comes_first(tmp_path):
 
 
 def test_alpha_is_dropped_or_laid_on_white(tmp_path):
-    image = picture(channels=4)
+    image = made_image(channels=4)
     write_image(tmp_path / "a.png", image)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), image[..., :3])
     rgb, alpha = image[..., :3] / 255, image[..., 3:] / 255
@@ -44,7 +44,7 @@ def test_alpha_is_dropped_or_laid_on_white(tmp_path):
 
 def test_a_gamma_chunk_changes_nothing(tmp_path):
     path = tmp_path / "a.png"
-    image = picture()
+    image = made_image()
     write_image(path, image)
     data = path.read_bytes()
     after_header = 8 + 25
@@ -55,7 +55,7 @@ def test_a_gamma_chunk_changes_nothing(tmp_path):
 
 
 def test_many_come_in_order(tmp_path):
-    images = [picture(size=(3, 5)) + np.uint8(i) for i in range(40)]
+    images = [made_image(size=(3, 5)) + np.uint8(i) for i in range(40)]
     for i, image in enumerate(images):
         write_image(tmp_path / f"{i:02d}.png", image)
     (tmp_path / ".hidden.png").touch()
@@ -66,14 +66,14 @@ def test_many_come_in_order(tmp_path):
 
 
 def test_writing_leaves_no_other_file(tmp_path):
-    write_image(tmp_path / "a.png", picture())
+    write_image(tmp_path / "a.png", made_image())
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_a_truncated_file_is_refused(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
-    write_image(path, picture(size=(64, 64)))
+    write_image(path, made_image(size=(64, 64)))
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(CaptureError, match="image file is truncated"):
         read_image(path)
@@ -88,8 +88,8 @@ def test_what_is_no_image_is_refused(tmp_path):
 
 
 def test_images_of_two_sizes_are_refused(tmp_path):
-    write_image(tmp_path / "a.png", picture(size=(4, 6)))
-    write_image(tmp_path / "b.png", picture(size=(4, 7)))
+    write_image(tmp_path / "a.png", made_image(size=(4, 6)))
+    write_image(tmp_path / "b.png", made_image(size=(4, 7)))
     message = "images differ in size or type.*b.png.*6x4 RGB 8 bit and 7x4 RGB 8 bit"
     with pytest.raises(CaptureError, match=re.compile(message, re.DOTALL)):
         read_images(list_images(tmp_path))

@@ -61,7 +61,7 @@ class Toy(nn.Module):
     def render(self, rays: Rays) -> Radiance:
         raise AssertionError("training renders nothing")
 
-    def develop(self, light: Tensor) -> Tensor:
+    def encode(self, light: Tensor) -> Tensor:
         return light
 
     def groups(self) -> list[Group]:

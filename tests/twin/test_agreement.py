@@ -64,9 +64,9 @@ def test_rectified_positions_count_at_the_nearest_pixel():
 
 def test_the_busiest_window_is_shown_recorded_first():
     events = random_events(3000)
-    picture = side_by_side(events[:0], events, EDGES)
-    assert picture.shape == (32, 40 + 4 + 40, 3)
-    assert (picture[:, 40:] == 255).all() and (picture[:, :40] < 255).any()
+    image = side_by_side(events[:0], events, EDGES)
+    assert image.shape == (32, 40 + 4 + 40, 3)
+    assert (image[:, 40:] == 255).all() and (image[:, :40] < 255).any()
 
 
 def test_what_cannot_be_compared_is_refused():

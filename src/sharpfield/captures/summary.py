@@ -230,7 +230,7 @@ def _trajectory_summary(capture: Capture) -> dict[str, Any]:
     return about | {"t_first_us": known[0], "t_last_us": known[1], "path_length": length}
 
 
-def shrunk(capture: Capture, factor: int) -> Capture:
+def downscaled(capture: Capture, factor: int) -> Capture:
     """A capture whose frames have a fraction of the width and height.
 
     Stored values are averaged as they are, which is how published data sets were made smaller.

@@ -17,8 +17,8 @@ from sharpfield.core.errors import OptionError
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.recipes.splats.merge import merge
-from sharpfield.runs.config import Started, read_started, write_started
-from sharpfield.runs.run import Reading, device_named, open_run, start
+from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
+from sharpfield.runs.run import ReadOptions, device_named, open_run, start
 from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
@@ -47,7 +47,7 @@ def blocks(
     device: Device = "auto",
     choice: Cut = CUT,
     options: Options = OPTIONS,
-    reading: Reading = READING,
+    reading: ReadOptions = READING,
 ) -> None:
     """Train a long capture in overlapping blocks, and merge them into one run.
 
@@ -71,12 +71,12 @@ def blocks(
     source = read(capture, **reading.given())
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
-    whole = Started(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
+    whole = RunConfig(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
     started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
     for run, block in zip(runs, started, strict=True):
         if read_ledger(run) is not None:  # finished ones are not opened again
-            check_settings(read_started(run).settings(), block.settings())
+            check_settings(read_run_config(run).settings(), block.settings())
     for i in _mine(count, os.environ):
         block, done = started[i], read_ledger(runs[i])
         if done is not None and done.finished:
@@ -111,20 +111,22 @@ def _together(ledgers: list[Ledger]) -> Ledger:
     )
 
 
-def _up_to_date(whole: Started, together: Ledger, out: Path, runs: list[Path]) -> bool:
+def _up_to_date(whole: RunConfig, together: Ledger, out: Path, runs: list[Path]) -> bool:
     """Whether the merged run was made of these blocks, as they are now."""
     if read_ledger(out) != together:  # written last
         return False
-    check_settings(read_started(out).settings(), whole.settings())
+    check_settings(read_run_config(out).settings(), whole.settings())
     merged, *blocks = (file_of(run, "last").stat().st_mtime_ns for run in (out, *runs))
     return all(block <= merged for block in blocks)
 
 
-def _merge(whole: Started, source: Capture, out: Path, runs: list[Path], together: Ledger) -> None:
+def _merge(
+    whole: RunConfig, source: Capture, out: Path, runs: list[Path], together: Ledger
+) -> None:
     """Write the merged run: what all workers that get here write is the same."""
     models = [open_run(run, device="cpu").model for run in runs]
     merged: Any = merge(models, blocks_of(source, len(runs)))
-    write_started(out, whole)
+    write_run_config(out, whole)
     progress = Progress(together.steps, together.steps, settings=whole.settings())
     save_last(out, merged, adam(merged), progress)
     write_ledger(out, together)

@@ -10,7 +10,7 @@ from sharpfield.captures.read import read_unposed
 from sharpfield.cli.arguments import screen
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions
 from sharpfield.preparation.calibrate.calibrate import calibrate as measure
-from sharpfield.preparation.calibrate.report import PICTURE, as_text, write_calibration
+from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
 
 MEASURING = CalibrateOptions()
 
@@ -34,7 +34,7 @@ def calibrate(
     about = write_calibration(held, made, out)
     console = screen()
     console.print(as_text(about), soft_wrap=True)
-    console.print(f"Numbers and a map of the pixels are in {out}; see {out / PICTURE}")
+    console.print(f"Numbers and a map of the pixels are in {out}; see {out / IMAGE}")
     if write_capture is not None:
         notes = held.notes | {"threshold_off": made.negative, "threshold_on": made.positive}
         native.write(replace(held, notes=notes, name=write_capture.name), write_capture)

@@ -32,13 +32,13 @@ from sharpfield.simulation.simulate_room import ROOM_RIG, RoomSensors, RoomTimin
 
 
 @dataclass(frozen=True)
-class Walked:
+class RoomOptions:
     """A walk through the room, whose frames come with measured depth."""
 
     blurry: float = 0.75
     """Share of the room's training frames that is blurred."""
     blur: Literal["motion", "published"] = "motion"
-    """By the walk, or each picture by a random kernel, as published."""
+    """By the walk, or each image by a random kernel, as published."""
     events: bool = False
     """Whether an event camera walks along; other scenes always have one."""
     depth_noise: float = 0.0
@@ -66,7 +66,7 @@ class Walked:
         )
 
 
-WALKED = Walked()
+ROOM_OPTIONS = RoomOptions()
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Recording:
     """A lens model; see `distortion`."""
     distortion: tuple[float, ...] = ()
     """Its coefficients, as OpenCV's: k1 k2 p1 p2 k3 of brown, k1 k2 k3 k4 of fisheye."""
-    walk: Walked = WALKED
+    walk: RoomOptions = ROOM_OPTIONS
 
     def sensors(self, base: Rig, size: tuple[int, int]) -> Rig:
         """The two sensors behind the lens of a rig."""
@@ -109,7 +109,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Around:
+class RigOptions:
     """Cameras before a moving scene; scenes that stand still have one, which moves."""
 
     rig: Literal["ring", "hand"] = "ring"
@@ -127,7 +127,7 @@ class Around:
 
 
 @dataclass(frozen=True)
-class Timed:
+class TimingOptions:
     """When the shutter opens, and how finely light is sampled; in brackets: moving scenes, room."""
 
     frames: int | None = None
@@ -137,9 +137,9 @@ class Timed:
     interval_us: int | None = None
     """From one exposure's start to the next: 56000 (31250, 100000)."""
     step_us: int | None = None
-    """Between two pictures of the scene: 1000 (1250, 4000 for events only)."""
+    """Between two images of the scene: 1000 (1250, 4000 for events only)."""
     most_change: float | None = None
-    """Largest change of log intensity between two pictures, which are placed closer where it is
+    """Largest change of log intensity between two images, which are placed closer where it is
     exceeded; 0 for even steps."""
     test_every: int | None = None
     """Every how many frames one is held out: 8; of a moving scene, of the held-out cameras."""
@@ -149,7 +149,7 @@ class Timed:
         return replace(base, **{k: v for k, v in vars(self).items() if v is not None})
 
 
-RECORDING, AROUND, TIMED, DEBLURRING = Recording(), Around(), Timed(), DeblurOptions()
+RECORDING, AROUND, TIMED, DEBLURRING = Recording(), RigOptions(), TimingOptions(), DeblurOptions()
 STILL_SIZE, MOVING_SIZE, ROOM_SIZE = "240x160", "64x64", "240x180"
 ROOM = "room"
 SCANNET_EVERY = 5
@@ -163,8 +163,8 @@ def simulate(
     layout: Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"] = "native",
     seed: int = 0,
     recording: Recording = RECORDING,
-    around: Around = AROUND,
-    timing: Timed = TIMED,
+    around: RigOptions = AROUND,
+    timing: TimingOptions = TIMED,
 ) -> None:
     """Record a closed-form scene with simulated cameras: frames, events, poses, sharp truth.
 
@@ -216,13 +216,13 @@ def footage(
     sensor: str = "ideal",
     seed: int = 0,
 ) -> None:
-    """Turn sharp high-rate pictures into blurry frames and events (poses stay unknown).
+    """Turn sharp high-rate images into blurry frames and events (poses stay unknown).
 
     Args:
-        source: A video, or a folder of pictures.
+        source: A video, or a folder of images.
         out: Folder of the capture.
-        group: Consecutive pictures in one exposure.
-        per_second: Pictures taken per second; a folder needs it, a video may say it itself.
+        group: Consecutive images in one exposure.
+        per_second: Images taken per second; a folder needs it, a video may say it itself.
         sensor: An event camera by name.
         seed: Of all noise.
     """
@@ -265,7 +265,7 @@ def deblur(
 
     Args:
         capture: Folder of the capture.
-        out: Folder for the pictures, a contact sheet and `deblur.json`.
+        out: Folder for the images, a contact sheet and `deblur.json`.
         layout: Of the capture, if it is not recognised.
         options: Method, instants.
     """

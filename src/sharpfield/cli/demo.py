@@ -15,7 +15,7 @@ from sharpfield.preparation.deblur import DeblurOptions, deblur
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.report.tables import markdown, methods_table
-from sharpfield.runs.config import Started
+from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import device_named, measure, open_run, start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -86,7 +86,7 @@ def with_deblurred_frames(capture: Capture) -> Capture:
     made = deblur(capture, DeblurOptions())
     frames = capture.needed_frames
     images = np.array(frames.images)
-    images[made.frame] = made.pictures[:, 0]
+    images[made.frame] = made.images[:, 0]
     middle = frames.exposure.middle_us
     sharp: Frames = replace(frames, images=images, exposure=Exposure(middle, middle))
     return replace(capture, frames=sharp)
@@ -111,7 +111,7 @@ def _compete(
     recipe = prepared(
         contender.recipe, recipe_named(contender.recipe)(), "draft", capture=capture, device=where
     )
-    started = Started(contender.recipe, recipe, str(source.resolve()), seed, contender.use)
+    started = RunConfig(contender.recipe, recipe, str(source.resolve()), seed, contender.use)
     options = Options(minutes=minutes, validate_every=200)
     start(started, capture, run, options, device=where, console=console)
     # All are measured against the same capture: blurry input, sharp truth.

@@ -34,7 +34,7 @@ def doctor(
 
     Args:
         capture: Folder of the capture, with or without poses.
-        out: Folder for `doctor.json`, `doctor.html` and its pictures.
+        out: Folder for `doctor.json`, `doctor.html` and its images.
         json: Print JSON instead of text.
         layout: Of the capture, if it is not recognised.
     """
@@ -43,8 +43,8 @@ def doctor(
     print(_text(about)) if json else _print(checkup)
     if out is not None:
         write_json(out / FINDINGS, about)
-        for number, pixels in enumerate(checkup.pictures.values()):
-            write_image(out / f"picture_{number}.png", pixels)
+        for number, pixels in enumerate(checkup.images.values()):
+            write_image(out / f"image_{number}.png", pixels)
         write_page(out / PAGE, checkup, held)
         if not json:
             screen().print(f"The page is {out / PAGE}", soft_wrap=True)
@@ -59,7 +59,7 @@ def as_json(checkup: Checkup) -> dict[str, Any]:
         "verdict": verdict(checkup),
         "counts": checkup.counts,
         "findings": [asdict(one) for one in checkup.sorted],
-        "pictures": {f"picture_{i}.png": name for i, name in enumerate(checkup.pictures)},
+        "images": {f"image_{i}.png": name for i, name in enumerate(checkup.images)},
     }
 
 

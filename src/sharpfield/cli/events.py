@@ -15,7 +15,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.report.event_frames import windows
-from sharpfield.runs.run import Opened, open_run
+from sharpfield.runs.run import OpenedRun, open_run
 from sharpfield.simulation.sensors.event_pixels import SENSORS, SIZES, EventSensor
 from sharpfield.storage.event_formats import expect_format
 from sharpfield.twin.match import match
@@ -86,11 +86,11 @@ class Pixels:
     subpixels: int = 1
     """Along each side of a pixel, whose light is their mean."""
     step_ms: float = 4.0
-    """Time between two rendered pictures where nothing changes."""
+    """Time between two rendered images where nothing changes."""
     shortest_ms: float = 1.0
     """And where light changes fastest."""
     most_change: float = 2.0
-    """Largest change of any pixel between two pictures, in thresholds."""
+    """Largest change of any pixel between two images, in thresholds."""
 
     def pace(self) -> Pace:
         """Steps of time."""
@@ -102,9 +102,9 @@ class Windows:
     """What is made of the events besides."""
 
     frames: Annotated[float | None, tyro.conf.arg(metavar="MS")] = None
-    """Write event frames of windows of this length, as arrays and pictures."""
+    """Write event frames of windows of this length, as arrays and images."""
     least_share: float = 0.0
-    """Leave out of frames and pictures what is less than this share of a frame's largest count;
+    """Leave out of frames and images what is less than this share of a frame's largest count;
     0.3 as in the published figures."""
     compare: bool = False
     """Say how the events agree with those that the capture's own camera recorded."""
@@ -163,7 +163,7 @@ def events(
         seen = _whole_steps(span, whole.span_us[1], pixels.pace())
         twin = EventTwin(light, seen, sensor, pace=pixels.pace(), seed=pixels.seed)
         made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
-    say = f"{made.count:,} events, from {twin.looks} pictures, are in {out}"
+    say = f"{made.count:,} events, from {twin.looks} images, are in {out}"
     console.print(say)
     if wanted.frames is not None:
         console.print(f"{len(edges)} event frames are in {wanted.frames}")
@@ -189,7 +189,7 @@ def _parts(twin: EventTwin, start_us: int, edges: list[int], tell: Tell) -> Iter
         tell(edge)
 
 
-def _seat(opened: Opened, place: Place, sensor: str) -> Viewpoint:
+def _seat(opened: OpenedRun, place: Place, sensor: str) -> Viewpoint:
     """Where to look from, as long as the camera's path lasts."""
     if place.trajectory is not None:
         seat = on_path(opened.model, *read_poses(place.trajectory))
@@ -230,7 +230,7 @@ def _whole_steps(span_us: tuple[int, int], last_us: int, pace: Pace) -> tuple[in
 
 
 def _matched(
-    console: Console, opened: Opened, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
+    console: Console, opened: OpenedRun, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
 ) -> EventSensor:
     """The sensor with thresholds that fit the scene; says what was found."""
     found = match(

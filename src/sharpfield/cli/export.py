@@ -9,7 +9,7 @@ from sharpfield.cli.arguments import screen
 from sharpfield.core.errors import OptionError
 from sharpfield.fields.gaussians.export import export_splats
 from sharpfield.recipes.splats.model import SplatModel
-from sharpfield.runs.run import Opened, open_run
+from sharpfield.runs.run import OpenedRun, open_run
 
 ENDING = ".ply"
 
@@ -46,7 +46,7 @@ def export(
     screen().print(f"{len(scene.gaussians):,} Gaussians are in {out}")
 
 
-def _with_gaussians(opened: Opened, run: Path) -> SplatModel:
+def _with_gaussians(opened: OpenedRun, run: Path) -> SplatModel:
     if not isinstance(opened.model, SplatModel):
         raise OptionError(
             "this run holds no Gaussians",

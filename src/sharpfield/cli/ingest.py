@@ -25,21 +25,21 @@ from sharpfield.preparation.ingest.ingest import Ingested, Tell
 from sharpfield.preparation.ingest.ingest import ingest as ingest_recordings
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import (
-    Choices,
+    AxisFixes,
     Cleaning,
     Crop,
-    Mistakes,
+    IngestOptions,
     Scene,
     Timing,
-    mended,
+    fixed_axes,
 )
-from sharpfield.recordings.open import FORMATS, Told, format_of, open_recording
+from sharpfield.recordings.open import FORMATS, ReaderOptions, format_of, open_recording
 from sharpfield.recordings.recording import Recording
 
-FRAMES_ONLY = ("video", "pictures")
+FRAMES_ONLY = ("video", "images")
 """Formats that hold no events."""
 
-NO_MISTAKES = Mistakes()
+NO_MISTAKES = AxisFixes()
 
 
 @dataclass(frozen=True)
@@ -61,19 +61,19 @@ class Source:
     event_encoding: str | None = None
     """Of Prophesee's RAW, where the header does not say: evt2, evt2.1, evt2.1-legacy or evt3."""
     frame_unit: str | None = None
-    """Of the times of pictures."""
+    """Of the times of images."""
     per_second: float | None = None
     """Frames taken per second, where nothing says when they were, or the video is slow motion."""
     times: Path | None = None
-    """The file that says when pictures were taken, where there are several."""
-    mistakes: Annotated[Mistakes, tyro.conf.arg(name="")] = NO_MISTAKES
+    """The file that says when images were taken, where there are several."""
+    mistakes: Annotated[AxisFixes, tyro.conf.arg(name="")] = NO_MISTAKES
     """Of the file, to be undone."""
 
     def opened(self, path: Path) -> Recording:
         """A recording, told those of the options that its format knows."""
         name = self._format(path)
         told = replace(
-            Told(),
+            ReaderOptions(),
             **{
                 option: value
                 for option, value in self._told(name).given().items()
@@ -82,7 +82,7 @@ class Source:
         )
         if told.size is not None and self.mistakes.swap_xy:
             told = replace(told, size=told.size[::-1])
-        return mended(open_recording(path, told, layout=name), self.mistakes)
+        return fixed_axes(open_recording(path, told, layout=name), self.mistakes)
 
     def expect_used(self, paths: tuple[Path, ...]) -> None:
         """Refuse options that none of the formats knows: they would have no effect.
@@ -114,9 +114,9 @@ class Source:
             raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
         return name
 
-    def _told(self, name: str) -> Told:
+    def _told(self, name: str) -> ReaderOptions:
         """What is told of a file of some format."""
-        return Told(
+        return ReaderOptions(
             unit=self.frame_unit if name in FRAMES_ONLY else self.unit,
             size=None if self.size is None else parse_size(self.size),
             topic=self.topic,
@@ -173,7 +173,7 @@ def ingest(
     opened = tuple(source.opened(path) for path in recordings)
     for recording in opened:
         console.print(f"{recording.path} is {recording.layout}")
-    choices = Choices(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
+    choices = IngestOptions(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
     with _telling(console) as tell:
         made = ingest_recordings(opened, out, choices, tell)
     for line in _story(made, out):

@@ -67,7 +67,7 @@ def poses(
     Args:
         capture: Folder of the capture; poses it has are not looked at.
         out: Folder of the new capture, with `poses.json` and `poses.html`.
-        options: Pictures, lens.
+        options: Images, lens.
         elsewhere: Poses from a file.
     """
     expect_replaceable(out, native.recognise)

@@ -1,4 +1,4 @@
-"""Commands about blur: judge the frames of a capture, blur pictures."""
+"""Commands about blur: judge the frames of a capture, blur images."""
 
 import json as json_format
 from pathlib import Path
@@ -11,7 +11,7 @@ from sharpfield.cli.arguments import screen
 from sharpfield.preparation.quality import (
     QualityOptions,
     as_table,
-    blur_pictures,
+    blur_images,
     judged,
     quality_to,
 )
@@ -70,16 +70,16 @@ def blur(
     probability: float = PROBABILITY,
     seed: int = 0,
 ) -> None:
-    """Blur sharp pictures by random motion kernels, as Hybrid Neural Rendering did its test data.
+    """Blur sharp images by random motion kernels, as Hybrid Neural Rendering did its test data.
 
     Args:
-        images: Folder of PNG or JPEG pictures.
+        images: Folder of PNG or JPEG images.
         out: Folder for the blurred ones, of the same names and sizes, and `blur.json`.
         k: Smallest size of a kernel in px, and the one above the largest.
         phi: Least and greatest intensity: how crooked a stroke is, 0...1.
-        probability: Share of pictures that are blurred.
+        probability: Share of images that are blurred.
         seed: Of all kernels.
     """
-    made = blur_pictures(images, out, ranges=KernelRange(k, phi, probability), seed=seed)
+    made = blur_images(images, out, ranges=KernelRange(k, phi, probability), seed=seed)
     count = sum(row["blurred"] for row in made)
-    screen().print(f"{count} of {len(made)} pictures were blurred; see {out}")
+    screen().print(f"{count} of {len(made)} images were blurred; see {out}")

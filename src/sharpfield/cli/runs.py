@@ -22,9 +22,9 @@ from sharpfield.metrics.lpips import load_lpips
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.presets import prepared
 from sharpfield.rendering.view import render_view, renderer_of
-from sharpfield.report.video import write_film
-from sharpfield.runs.config import Started
-from sharpfield.runs.run import Reading, device_named, measure, open_run, start
+from sharpfield.report.video import write_video
+from sharpfield.runs.config import RunConfig
+from sharpfield.runs.run import ReadOptions, device_named, measure, open_run, start
 from sharpfield.training.plan import Options
 
 EIGHT_BIT = 255
@@ -45,7 +45,7 @@ class Choice:
     """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
 
 
-CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), Reading(), Refinement()
+CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), ReadOptions(), Refinement()
 
 
 def train(
@@ -56,7 +56,7 @@ def train(
     device: Device = "auto",
     choice: Choice = CHOICE,
     options: Options = OPTIONS,
-    reading: Reading = READING,
+    reading: ReadOptions = READING,
 ) -> None:
     """Train a recipe on a capture.
 
@@ -75,7 +75,7 @@ def train(
     made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
     where_from, given = str(capture.resolve()), reading.given()
-    started = Started(recipe, made, where_from, seed, choice.use, given, choice.block)
+    started = RunConfig(recipe, made, where_from, seed, choice.use, given, choice.block)
     ledger = start(started, source, out, options, device=where, console=console)
     if ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")
@@ -124,7 +124,7 @@ def render(
     run: Positional[Path],
     out: Path,
     path: str = "spiral",
-    pictures: int = 60,
+    images: int = 60,
     rate: float = 30.0,
     capture: Path | None = None,
     device: Device = "auto",
@@ -133,10 +133,10 @@ def render(
 
     Args:
         run: Folder that `train` made.
-        out: A film FILE.mp4, or a folder for PNGs.
+        out: A video FILE.mp4, or a folder for PNGs.
         path: spiral, train, or exposure:N for the inside of one exposure.
-        pictures: How many.
-        rate: Pictures per second of a film.
+        images: How many.
+        rate: Images per second of a video.
         capture: Where the capture is, if it moved.
         device: Where to render.
     """
@@ -144,24 +144,24 @@ def render(
     opened = open_run(run, capture=capture, device=device)
     model = opened.model
     where = device_named(device)
-    camera_moves = camera_path(opened.seen, path, pictures=pictures)
+    camera_moves = camera_path(opened.seen, path, images=images)
 
     def rendered(number: int) -> np.ndarray:
         pose = torch.from_numpy(camera_moves.poses[number]).to(where)
         time = float(camera_moves.time[number])
         seen = render_view(renderer_of(model), model.capture.camera, pose, time)
-        return eight_bit(model.develop(seen.rgb))
+        return eight_bit(model.encode(seen.rgb))
 
     numbers = track(
         range(len(camera_moves)), "rendering", console=console, disable=not console.is_terminal
     )
-    count = write_film(out, (rendered(number) for number in numbers), rate=rate)
-    console.print(f"{count} pictures are in {out}")
+    count = write_video(out, (rendered(number) for number in numbers), rate=rate)
+    console.print(f"{count} images are in {out}")
 
 
-def eight_bit(picture: torch.Tensor) -> np.ndarray:
+def eight_bit(image: torch.Tensor) -> np.ndarray:
     """Stored values 0...1 as bytes."""
-    return (picture.clamp(0, 1) * EIGHT_BIT).round().byte().cpu().numpy()
+    return (image.clamp(0, 1) * EIGHT_BIT).round().byte().cpu().numpy()
 
 
 def changed(recipe: Any, changes: tuple[str, ...]) -> Any:

@@ -1,1 +1,1 @@
-"""The nouns of the house: what flows from a recording to a rendered picture."""
+"""The nouns of the house: what flows from a recording to a rendered image."""

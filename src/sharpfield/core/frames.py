@@ -23,7 +23,7 @@ from sharpfield.core.errors import CaptureError
 class Exposure:
     """Opening and closing time of the shutter for each frame, in us on the capture's clock.
 
-    A frame with `open_us == close_us` is an instant: a sharp picture, as far as motion goes.
+    A frame with `open_us == close_us` is an instant: a sharp image, as far as motion goes.
     """
 
     open_us: Int64[np.ndarray, "n"]

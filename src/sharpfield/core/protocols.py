@@ -154,7 +154,7 @@ class Model(Protocol):
         """Sharp linear light, without any randomness."""
         ...
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """Linear light as the frames would store it, 0...1."""
         ...
 

@@ -1,6 +1,6 @@
-"""Numbers beside those of pictures: brightness left open, depth.
+"""Numbers beside those of images: brightness left open, depth.
 
-Source: EvDNeRF (WACV 2024) for the alignment of single pictures, which is EventNeRF's (CVPR 2023)
+Source: EvDNeRF (WACV 2024) for the alignment of single images, which is EventNeRF's (CVPR 2023)
 formula.
 """
 
@@ -23,7 +23,7 @@ SOLID = 0.5
 TINY = 1e-9
 
 DEFINITIONS = {
-    "psnr_aligned": "psnr of the luma, once log(0.1 + luma) of each picture is fitted to that of"
+    "psnr_aligned": "psnr of the luma, once log(0.1 + luma) of each image is fitted to that of"
     " its reference by a gain and an offset (as published)",
     "depth_error": "mean relative error of the depth of each view, at most 1 a pixel, where the"
     " truth has one, after a common scale (the ratio of the medians of all views); what is less"
@@ -32,10 +32,10 @@ DEFINITIONS = {
 
 
 def aligned_psnr(
-    picture: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"], highest: float = 100.0
+    image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"], highest: float = 100.0
 ) -> float:
-    """PSNR after the brightness of a picture was brought to its reference's, both 0...1."""
-    want, have = ((luma(image).double() + DARK).log() for image in (reference, picture))
+    """PSNR after the brightness of a image was brought to its reference's, both 0...1."""
+    want, have = ((luma(one).double() + DARK).log() for one in (reference, image))
     spread = have.var(correction=0)
     gain = ((want * have).mean() - want.mean() * have.mean()) / spread.clamp_min(TINY)
     fitted = (gain * (have - have.mean()) + want.mean()).exp() - DARK

@@ -1,9 +1,9 @@
-"""From a model's linear light to pictures that may be compared with stored ones.
+"""From a model's linear light to images that may be compared with stored ones.
 
 A model that saw frames develops its own light. Events alone report changes of log intensity, so a
 field learned from nothing else knows its light up to an unknown offset and an unknown gain (the
 contrast threshold) of the logarithm. Before comparing, one line per channel is fitted that takes
-the log of rendered light to the log of stored values, over all compared pictures at once; it
+the log of rendered light to the log of stored values, over all compared images at once; it
 absorbs any power-law tone curve as well. A sensor without colour filters knows luma only.
 
 Source: the evaluation of EventNeRF (CVPR 2023) and of the event-based fields that followed it.
@@ -22,7 +22,7 @@ from sharpfield.metrics.image import luma
 DARK = 1e-3
 """Values below this count as this: the logarithm of nearly nothing would rule the fit."""
 
-Picture = Float[Tensor, "h w c"]
+Image = Float[Tensor, "h w c"]
 
 
 @dataclass(frozen=True)
@@ -32,28 +32,28 @@ class LogAffine:
     gain: Float[Tensor, "c"]
     offset: Float[Tensor, "c"]
 
-    def __call__(self, light: Picture) -> Picture:
+    def __call__(self, light: Image) -> Image:
         """Rendered light as the frames would store it."""
         return (self.gain * light.clamp_min(DARK).log() + self.offset).exp()
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """How light becomes a picture, and in which channels pictures are compared."""
+    """How light becomes a image, and in which channels images are compared."""
 
-    develop: Callable[[Tensor], Tensor]
+    encode: Callable[[Tensor], Tensor]
     """As the frames store light, if the model knows that."""
     aligned: LogAffine | None = None
     """Used instead, if it does not."""
     grey: bool = False
     """Whether only luma is compared."""
 
-    def picture(self, light: Picture) -> Float[Tensor, "h w d"]:
+    def image(self, light: Image) -> Float[Tensor, "h w d"]:
         """Display domain, 0...1, not quantised."""
         light = self.reference(light)
-        return (self.develop(light) if self.aligned is None else self.aligned(light)).clamp(0, 1)
+        return (self.encode(light) if self.aligned is None else self.aligned(light)).clamp(0, 1)
 
-    def reference(self, image: Picture) -> Float[Tensor, "h w d"]:
+    def reference(self, image: Image) -> Float[Tensor, "h w d"]:
         """An image in the channels that are compared."""
         return luma(image)[..., None] if self.grey else image
 
@@ -69,30 +69,30 @@ class Brightness:
 
 
 def fit_brightness(
-    develop: Callable[[Tensor], Tensor],
-    compared: Sequence[tuple[Picture, Float[Tensor, "h w d"]]],
+    encode: Callable[[Tensor], Tensor],
+    compared: Sequence[tuple[Image, Float[Tensor, "h w d"]]],
     *,
     grey: bool,
 ) -> Brightness:
     """The brightness of a model of events alone.
 
     Args:
-        develop: Used where there is nothing to align to.
+        encode: Used where there is nothing to align to.
         compared: Pairs of rendered light and reference.
         grey: The sensor had no colour filters.
     """
-    plain = Brightness(develop, grey=grey)
+    plain = Brightness(encode, grey=grey)
     if not compared:
         return plain
     light = [plain.reference(light) for light, _ in compared]
     stored = [plain.reference(image) for _, image in compared]
-    return Brightness(develop, fit_log_affine(light, stored), grey=grey)
+    return Brightness(encode, fit_log_affine(light, stored), grey=grey)
 
 
-def fit_log_affine(light: Sequence[Picture], stored: Sequence[Picture]) -> LogAffine:
-    """The line per channel with the least squared error in log intensity, over all pictures."""
-    x = torch.cat([picture.flatten(0, 1) for picture in light]).double().clamp_min(DARK).log()
-    y = torch.cat([picture.flatten(0, 1) for picture in stored]).double().clamp_min(DARK).log()
+def fit_log_affine(light: Sequence[Image], stored: Sequence[Image]) -> LogAffine:
+    """The line per channel with the least squared error in log intensity, over all images."""
+    x = torch.cat([image.flatten(0, 1) for image in light]).double().clamp_min(DARK).log()
+    y = torch.cat([image.flatten(0, 1) for image in stored]).double().clamp_min(DARK).log()
     from_x = x - x.mean(0)
     spread = from_x.square().sum(0)
     slope = (from_x * (y - y.mean(0))).sum(0) / spread.clamp_min(torch.finfo(x.dtype).tiny)

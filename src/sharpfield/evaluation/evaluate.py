@@ -1,7 +1,7 @@
-"""How good a trained model is: its views against pictures it has not seen, and sharp truth.
+"""How good a trained model is: its views against images it has not seen, and sharp truth.
 
 `RUN/metrics.json` says under which protocol each number was measured; `RUN/renders/` holds the
-pictures. Pictures are compared in the display domain, as the frames store them.
+images. Images are compared in the display domain, as the frames store them.
 
 A render is made from the middle of a frame's exposure, in the model's own space. The capture that
 is compared with may hold more than the model was trained on (frames, say, for a model that saw
@@ -24,8 +24,8 @@ from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.alignment_and_depth import aligned_psnr, depth_error, distances
 from sharpfield.evaluation.brightness import Brightness
-from sharpfield.evaluation.event_films import event_films
 from sharpfield.evaluation.event_scores import event_scores
+from sharpfield.evaluation.event_videos import event_videos
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
 from sharpfield.evaluation.views import View, brightness_of, held_out, seen_at, trained_on
@@ -121,7 +121,7 @@ def evaluate(
         "train": _training(run),
     }
     if (events := event_scores(model, capture)) is not None:
-        metrics["events"] = {**events, "films": event_films(model, capture, run)}
+        metrics["events"] = {**events, "videos": event_videos(model, capture, run)}
     metrics["mean"] |= _more(model, capture, test_views, brightness, events)
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
@@ -145,11 +145,11 @@ class _Shown:
 
 
 def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path) -> dict[str, Any]:
-    """Write the pictures of a view, and give its row of the metrics."""
+    """Write the images of a view, and give its row of the metrics."""
     reference = view.reference
-    picture = brightness.picture(view.light)
+    image = brightness.image(view.light)
     name = f"{reference.frame:04d}"
-    write_image(folder / f"{name}.png", eight_bit(picture.numpy()))
+    write_image(folder / f"{name}.png", eight_bit(image.numpy()))
     write_image(folder / f"{name}_depth.png", colour_depth(view.depth.numpy()))
     row: dict[str, Any] = {
         "name": reference.name,
@@ -159,7 +159,7 @@ def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path
     if reference.image is None:
         row |= dict.fromkeys(NAMES)
     else:
-        row |= score(picture, brightness.reference(reference.image), lpips)
+        row |= score(image, brightness.reference(reference.image), lpips)
     return row | {
         "seconds": round(view.seconds, 3),
         "image": f"renders/{folder.name}/{name}.png",
@@ -183,7 +183,7 @@ def _more(
     pairs = [(view.light, image) for view in views if (image := view.reference.image) is not None]
     if pairs and capture.events is not None:
         found["psnr_aligned"] = math.fsum(
-            aligned_psnr(brightness.picture(light), brightness.reference(image), HIGHEST_PSNR)
+            aligned_psnr(brightness.image(light), brightness.reference(image), HIGHEST_PSNR)
             for light, image in pairs
         ) / len(pairs)
     frames = capture.frames
@@ -208,7 +208,7 @@ def _summary(
         measured, truth = view.reference.measured, view.reference.image
         measured = brightness.reference(measured)
         row["sharpness"] = {
-            "result": float(laplacian_variance(brightness.picture(view.light))),
+            "result": float(laplacian_variance(brightness.image(view.light))),
             "input": float(laplacian_variance(measured)),
         }
         if truth is not None:

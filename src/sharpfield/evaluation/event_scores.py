@@ -133,7 +133,7 @@ def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
             {
                 "event_psnr": _psnr(change, measured, 2 * most),
                 "event_mae": float((change - measured).abs().mean()),
-                "event_ssim": float(ssim(*(_as_picture(x, most) for x in (change, measured)))),
+                "event_ssim": float(ssim(*(_as_image(x, most) for x in (change, measured)))),
                 "count_psnr": _psnr(predicted.clamp(-MOST, MOST), net.clamp(-MOST, MOST), 2 * MOST),
                 "count_mae_busy": _mean_where((predicted - net).abs(), busy),
                 "count_mae_silent": _mean_where((predicted - net).abs(), ~busy),
@@ -156,7 +156,7 @@ def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:
     return 10 * math.log10(peak**2 / max(error, 1e-10 * peak**2))
 
 
-def _as_picture(change: Tensor, most: float) -> Float[Tensor, "h w 1"]:
+def _as_image(change: Tensor, most: float) -> Float[Tensor, "h w 1"]:
     return ((change / most).clamp(-1, 1) / 2 + 0.5)[..., None]
 
 

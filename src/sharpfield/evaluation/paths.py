@@ -1,4 +1,4 @@
-"""Camera paths to render films along: poses and times, in the space of the capture they are for.
+"""Camera paths to render videos along: poses and times, in the space of the capture they are for.
 
     spiral        around the average camera where all look the same way, else around the scene
     train         along the trajectory of the recording, or from photo to photo
@@ -36,7 +36,7 @@ PATHS = "spiral, train, or exposure:N with the number of a frame"
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Where and when to render each picture of a film."""
+    """Where and when to render each image of a video."""
 
     poses: Float32[np.ndarray, "n 3 4"]
     """World-from-camera."""
@@ -44,64 +44,64 @@ class CameraPath:
     """0...1 of the capture."""
 
     def __len__(self) -> int:
-        """Number of pictures."""
+        """Number of images."""
         return len(self.time)
 
 
-def camera_path(capture: Capture, path: str, *, pictures: int = 60) -> CameraPath:
+def camera_path(capture: Capture, path: str, *, images: int = 60) -> CameraPath:
     """The path of a name.
 
     Args:
         capture: In the space to render in: a model's own capture.
         path: `spiral`, `train` or `exposure:N`.
-        pictures: How many.
+        images: How many.
 
     Raises:
         OptionError: There is no such path, or the capture does not have it.
     """
-    if pictures < 1:
-        raise OptionError("a path needs at least one picture", got=pictures)
+    if images < 1:
+        raise OptionError("a path needs at least one image", got=images)
     kind, _, argument = path.partition(":")
     if kind == "exposure" and argument.isdecimal():
-        return within_exposure(capture, int(argument), pictures)
+        return within_exposure(capture, int(argument), images)
     makers: dict[str, Callable[[Capture, int], CameraPath]] = {"spiral": spiral, "train": along}
     if path not in makers:
         raise OptionError("unknown camera path", got=path, do=f"use {PATHS}")
-    return makers[path](capture, pictures)
+    return makers[path](capture, images)
 
 
-def spiral(capture: Capture, pictures: int) -> CameraPath:
+def spiral(capture: Capture, images: int) -> CameraPath:
     """Around what is seen, while time runs through the capture.
 
     Where all cameras look roughly the same way, LLFF's spiral around the average camera, as wide
     as the cameras stand apart; else a circle around the point that they look at.
     """
     poses = _seen_from(capture)
-    angle = np.linspace(0, 2 * math.pi * TURNS, pictures, endpoint=False)
+    angle = np.linspace(0, 2 * math.pi * TURNS, images, endpoint=False)
     target = None if forward_facing(poses) else focus(poses)
     if target is None:
         made = _spiral(poses, angle, capture.near, capture.far)
     else:
         made = _circle(poses, target, angle / TURNS)
-    time = np.linspace(0, 1, pictures) if pictures > 1 else np.full(1, 0.5)
+    time = np.linspace(0, 1, images) if images > 1 else np.full(1, 0.5)
     return CameraPath(made.astype(np.float32), time.astype(np.float32))
 
 
-def along(capture: Capture, pictures: int) -> CameraPath:
+def along(capture: Capture, images: int) -> CameraPath:
     """Along the recording: evenly in time if the camera's motion is known, else photo to photo."""
     known = capture.trajectory.known_us(0)
     if known is not None:
-        return _on_track(capture, _between(capture, *known, pictures), 0)
+        return _on_track(capture, _between(capture, *known, images), 0)
     train, exposure = capture.split.train, capture.needed_frames.exposure
     stamps, poses = exposure.middle_us[train], _frame_poses(capture, train)
     # Between photos in no particular order a curve would swing wildly; lines stay among them.
     through = Stamped(stamps, poses, capture.clock, translation="linear")
-    time = _between(capture, int(stamps[0]), int(stamps[-1]), pictures).astype(np.float32)
-    made = through.pose(torch.from_numpy(time), torch.zeros(pictures).long())
+    time = _between(capture, int(stamps[0]), int(stamps[-1]), images).astype(np.float32)
+    made = through.pose(torch.from_numpy(time), torch.zeros(images).long())
     return CameraPath(made.numpy(), time)
 
 
-def within_exposure(capture: Capture, frame: int, pictures: int) -> CameraPath:
+def within_exposure(capture: Capture, frame: int, images: int) -> CameraPath:
     """Through the exposure of one frame, both ends included.
 
     Raises:
@@ -119,7 +119,7 @@ def within_exposure(capture: Capture, frame: int, pictures: int) -> CameraPath:
             do="choose a frame that was exposed for a while, or another path",
         )
     opens, closes = frames.exposure.open_us[frame], frames.exposure.close_us[frame]
-    time = _between(capture, int(opens), int(closes), pictures)
+    time = _between(capture, int(opens), int(closes), images)
     return _on_track(capture, time, int(frames.track[frame]))
 
 
@@ -179,11 +179,9 @@ def _frame_poses(capture: Capture, frames: Int64[np.ndarray, "m"]) -> Float[np.n
     return _poses(capture, time, held.track[frames]).astype(np.float64)
 
 
-def _between(
-    capture: Capture, first_us: int, last_us: int, pictures: int
-) -> Float[np.ndarray, "n"]:
+def _between(capture: Capture, first_us: int, last_us: int, images: int) -> Float[np.ndarray, "n"]:
     first, last = capture.clock.unit(np.array([first_us, last_us]))
-    return np.linspace(first, last, pictures)
+    return np.linspace(first, last, images)
 
 
 def _on_track(capture: Capture, time: Float[np.ndarray, "n"], track: int) -> CameraPath:

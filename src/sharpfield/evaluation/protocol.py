@@ -30,7 +30,7 @@ def describe(
         capture: What is compared with.
         test: The held-out references.
         lpips: None if it is not computed.
-        too_small: It is not, because the pictures are too small for its network.
+        too_small: It is not, because the images are too small for its network.
     """
     frames = capture.frames
     return {
@@ -72,6 +72,6 @@ def _lpips(lpips: Lpips | None, too_small: bool) -> dict[str, Any]:
     if lpips is not None:
         return {"computed": True, "version": "0.1", "network": lpips.network, **lpips.sha256}
     if too_small:
-        reason = f"pictures are smaller than the network allows ({SMALLEST_PX} px)"
+        reason = f"images are smaller than the network allows ({SMALLEST_PX} px)"
         return {"computed": False, "reason": reason, "enable": "evaluate at a larger size"}
     return {"computed": False, "reason": "no weights were given", "enable": ENABLE_LPIPS}

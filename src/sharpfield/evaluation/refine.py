@@ -3,10 +3,10 @@
 Where training poses were estimated or refined, the space of the model is not quite the space of
 the held-out poses, and a shift of a pixel costs more PSNR than any blur. So the held-out poses are
 first brought to the model's space by a similarity (`aligned_poses`) and then each is improved by
-gradient descent on the difference between render and picture, with the model frozen
+gradient descent on the difference between render and image, with the model frozen
 (`refine_poses`).
 
-The better of all poses looked at is chosen by the PSNR on the very picture that is then measured,
+The better of all poses looked at is chosen by the PSNR on the very image that is then measured,
 which is optimistic by construction; the protocol says so.
 
 Source: BAD-NeRF (CVPR 2023) for the idea; numbers as in the authors' successor of Ev-DeblurNeRF
@@ -131,11 +131,11 @@ def refine_poses(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Refined:
-    """Poses from which the model's renders look most like the held-out pictures.
+    """Poses from which the model's renders look most like the held-out images.
 
     Args:
         model: Trained; it is not changed.
-        capture: Holds the pictures.
+        capture: Holds the images.
         how: Options.
         start: Poses to begin with, by frame; by default the model's own.
         seed: For the choice of pixels.
@@ -257,9 +257,9 @@ def _error(
             cast(camera, pose.expand(len(pixels), 3, 4), xy, view.time * ones, ones)
         )
     stored = view.image[row, column]
-    error = (model.develop(seen.rgb) - stored).square().mean()
+    error = (model.encode(seen.rgb) - stored).square().mean()
     if seen.coarse is not None:
-        error = error + (model.develop(seen.coarse.rgb) - stored).square().mean()
+        error = error + (model.encode(seen.coarse.rgb) - stored).square().mean()
     return error
 
 
@@ -283,10 +283,10 @@ def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) ->
         rows = moved_rows(view.rows, view.start, pose)
         light = render_view(renderer_of(model), model.capture.camera, pose, view.time, rows=rows)
         light = light.rgb.to(twist.device)
-        picture = model.develop(light).clamp(0, 1)
-        stored = view.image.expand_as(picture)
-        error = (picture - stored).square().mean(-1).reshape(-1)
-        found.append(_Seen(twist, float(psnr(picture, stored)), error))
+        image = model.encode(light).clamp(0, 1)
+        stored = view.image.expand_as(image)
+        error = (image - stored).square().mean(-1).reshape(-1)
+        found.append(_Seen(twist, float(psnr(image, stored)), error))
     return found
 
 
@@ -307,7 +307,7 @@ def _on_a_line(poses: Float[Tensor, "m 3 4"]) -> bool:
 
 def _protocol(how: Refinement) -> dict[str, Any]:
     chosen = (
-        f"best PSNR of full renders every {how.every} steps, per view, on the measured picture"
+        f"best PSNR of full renders every {how.every} steps, per view, on the measured image"
         " (optimistic)"
         if how.every
         else "pose after the last step"

@@ -1,9 +1,9 @@
 """A run as one HTML file: what was captured, what came out, how good it is, how it was made.
 
-The page needs no server and no network: pictures, drawings, style and script are inside it. It
-reads the pictures that `evaluate` wrote to `RUN/renders/`, and the losses in `RUN/log.csv`.
+The page needs no server and no network: images, drawings, style and script are inside it. It
+reads the images that `evaluate` wrote to `RUN/renders/`, and the losses in `RUN/log.csv`.
 
-The pictures of the report that are compared with each other.
+The images of the report that are compared with each other.
 """
 
 import html
@@ -18,14 +18,14 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
 from sharpfield.core.paper import Paper
 from sharpfield.core.seed import evenly_spread
-from sharpfield.evaluation.event_films import events_section
+from sharpfield.evaluation.event_videos import events_section
 from sharpfield.evaluation.views import SHARP, TRUTH, Reference, held_out, trained_on
 from sharpfield.metrics.image import luma
 from sharpfield.report import page
 from sharpfield.report.capture import captured
 from sharpfield.report.colormaps import ERROR_WHITE, colour_error, eight_bit
 from sharpfield.report.figures import curves_figure
-from sharpfield.report.page import Colours, Look, Picture, View, section
+from sharpfield.report.page import Colours, Image, Look, View, section
 from sharpfield.report.tables import as_html, methods_table, number, views_table
 from sharpfield.storage.images import read_image
 
@@ -49,7 +49,7 @@ def compared_views(
     """Views with their input, result, baselines, truth, error and depth, as far as there are.
 
     Args:
-        run: Where the pictures lie.
+        run: Where the images lie.
         capture: Gives inputs and references.
         metrics: Names the baselines, and the folders of their renders.
         rows: Views of `metrics.json`; some are chosen if there are many.
@@ -76,32 +76,30 @@ def _view(
     recorded: str,
 ) -> View:
     result = read_image(run / row["image"])
-    pictures = []
+    images = []
     if reference.kind in (TRUTH, ""):
         measured = eight_bit(reference.measured.numpy())
-        pictures.append(_picture(recorded, measured, reference.name, row.get("input")))
-    pictures.append(_picture(RESULT, result, reference.name, row))
+        images.append(_image(recorded, measured, reference.name, row.get("input")))
+    images.append(_image(RESULT, result, reference.name, row))
     for name, folder in others.items():
         if (folder / row["image"]).is_file():
-            pictures.append(_picture(name, read_image(folder / row["image"]), reference.name))
+            images.append(_image(name, read_image(folder / row["image"]), reference.name))
     if reference.image is not None:
         kind = TRUTH if reference.kind in (TRUTH, SHARP) else STORED
-        pictures.append(_picture(kind, eight_bit(reference.image.numpy()), reference.name))
+        images.append(_image(kind, eight_bit(reference.image.numpy()), reference.name))
         grey = result.shape[-1] < reference.image.shape[-1]
         truth = luma(reference.image)[..., None] if grey else reference.image
         error = colour_error(result.astype(np.float32) / 255, truth.numpy())
-        pictures.append(_picture(ERROR, error, reference.name))
+        images.append(_image(ERROR, error, reference.name))
     if (run / row["depth"]).is_file():
-        pictures.append(_picture(DEPTH, read_image(run / row["depth"]), reference.name))
-    return View(reference.name, tuple(pictures))
+        images.append(_image(DEPTH, read_image(run / row["depth"]), reference.name))
+    return View(reference.name, tuple(images))
 
 
-def _picture(
-    kind: str, pixels: Colours, name: str, scores: Mapping[str, Any] | None = None
-) -> Picture:
+def _image(kind: str, pixels: Colours, name: str, scores: Mapping[str, Any] | None = None) -> Image:
     known = scores is not None and scores.get("psnr") is not None
     caption = f"{kind}, {number('psnr', scores or {})} dB" if known else kind
-    return Picture(kind, pixels, caption, f"{kind} of view {name}")
+    return Image(kind, pixels, caption, f"{kind} of view {name}")
 
 
 REPORT = "report.html"
@@ -131,7 +129,7 @@ def write_report(run: Path, capture: Capture, metrics: Mapping[str, Any], story:
         story: Title, settings, paper.
 
     Returns:
-        The file. It is smaller than `BUDGET_BYTES` unless not even small pictures fit.
+        The file. It is smaller than `BUDGET_BYTES` unless not even small images fit.
     """
     written = ""
     for look in LOOKS:
@@ -222,7 +220,7 @@ def _result(
         worst = _blurriest(train, metrics)
         parts.append(page.comparison(train, look, left=recorded, right=RESULT, first=worst))
     if test:
-        right = TRUTH if TRUTH in [p.kind for p in test[0].pictures] else STORED
+        right = TRUTH if TRUTH in [p.kind for p in test[0].images] else STORED
         parts.append("<h3>Held-out views, which training never saw</h3>")
         parts.append(page.comparison(test, look, left=RESULT, right=right))
     alignment = metrics["protocol"]["alignment"]
@@ -235,7 +233,7 @@ def _result(
         "The result",
         *parts,
         legend if parts else "",
-        intro="Drag the line, or use the arrow keys. Choose any two pictures to compare.",
+        intro="Drag the line, or use the arrow keys. Choose any two images to compare.",
     )
 
 
@@ -252,7 +250,7 @@ def _numbers(metrics: Mapping[str, Any]) -> str:
     protocol, learned = metrics["protocol"], metrics["train_views"]
     parts = []
     if metrics["mean"]["psnr"] is None:
-        why = protocol["why_no_scores"] or "there is no picture to compare with"
+        why = protocol["why_no_scores"] or "there is no image to compare with"
         parts.append(f'<p class="note">No held-out scores: {html.escape(why)}.</p>')
     elif metrics.get("baselines"):
         parts += ["<h3>Beside other methods, held-out views</h3>", as_html(methods_table(metrics))]

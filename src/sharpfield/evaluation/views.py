@@ -40,7 +40,7 @@ UNSCORED = 3
 
 @dataclass(frozen=True)
 class Reference:
-    """A frame, and the picture a render from its mid-exposure pose should look like."""
+    """A frame, and the image a render from its mid-exposure pose should look like."""
 
     frame: int
     name: str
@@ -157,8 +157,8 @@ def brightness_of(model: Model, views: list[View], *, blind: bool | None = None)
     home = device_of(model)
 
     @torch.no_grad()
-    def develop(light: Tensor) -> Tensor:
-        return model.develop(light.to(home)).cpu()
+    def encode(light: Tensor) -> Tensor:
+        return model.encode(light.to(home)).cpu()
 
     events = model.capture.events
     blind = model.capture.frames is None if blind is None else blind
@@ -166,8 +166,8 @@ def brightness_of(model: Model, views: list[View], *, blind: bool | None = None)
         (view.light, view.reference.image) for view in views if view.reference.image is not None
     ]
     if not blind or events is None:
-        return Brightness(develop, grey=any(image.shape[-1] == 1 for _, image in compared))
-    return fit_brightness(develop, compared, grey=not events.coloured)
+        return Brightness(encode, grey=any(image.shape[-1] == 1 for _, image in compared))
+    return fit_brightness(encode, compared, grey=not events.coloured)
 
 
 VIEWS = 2
@@ -182,7 +182,7 @@ def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], flo
         views: How many; the same ones every time, evenly spread.
 
     Returns:
-        The score; None where there is no picture to compare with.
+        The score; None where there is no image to compare with.
     """
     known = [reference for reference in held_out(capture) if reference.image is not None]
     if not known:
@@ -193,7 +193,7 @@ def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], flo
         seen = [seen_at(model, reference, capture) for reference in chosen]
         brightness = brightness_of(model, seen)
         scores = [
-            psnr(brightness.picture(view.light), brightness.reference(image))
+            psnr(brightness.image(view.light), brightness.reference(image))
             for view in seen
             if (image := view.reference.image) is not None
         ]

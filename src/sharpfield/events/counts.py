@@ -60,7 +60,7 @@ def _count(x, y, p, counts):
         counts[1 if p[i] > 0 else 0, y[i], x[i], 0] += 1
 
 
-def on_row_clock(events: EventStream, row_delay_us: float) -> EventStream:
+def on_frame_clock(events: EventStream, row_delay_us: float) -> EventStream:
     """The same events, each as much earlier as its row is read later, in order of these times.
 
     Args:

@@ -1,4 +1,4 @@
-"""The event double integral: a sharp picture from a blurred one and the events of its exposure.
+"""The event double integral: a sharp image from a blurred one and the events of its exposure.
 
 Motion blur averages light over the exposure, B = mean of I(t), and events tell how the light of
 each pixel moved, I(t) = I(f) exp(E(t) - E(f)), with E the change of log light since the shutter
@@ -35,7 +35,7 @@ FLOOR = 1e-4
 
 
 def latent(blurred: Float[Tensor, "h w c"], path: LogPath, instant: int) -> Float[Tensor, "h w c"]:
-    """The sharp picture at one of the path's instants, in the domain of `blurred`; not clipped.
+    """The sharp image at one of the path's instants, in the domain of `blurred`; not clipped.
 
     A path of one channel moves all colours alike.
     """
@@ -132,15 +132,15 @@ def joint_latents(
     *,
     trust: Float[Tensor, "g h w c"] | float = 1.0,
 ) -> Float[Tensor, "n h w c"]:
-    """Log light of n pictures that agrees with every exposure and with the events in between.
+    """Log light of n images that agrees with every exposure and with the events in between.
 
     Per pixel, least squares of one equation per exposure, x_i = alone_i, and one per gap,
     x_{i+1} - x_i = gaps_i. The normal equations are tridiagonal and are solved for all pixels at
-    once, forwards and backwards along the pictures.
+    once, forwards and backwards along the images.
 
     Args:
         alone: What each exposure says by itself: log B_i + E(f_i) - log_mean_i.
-        gaps: Change of log light from each picture to the next, g = n - 1.
+        gaps: Change of log light from each image to the next, g = n - 1.
         trust: Weight of each gap's equation; an exposure's is 1.
     """
     links = torch.ones_like(gaps) * trust

@@ -1,4 +1,4 @@
-"""Pictures of events: values at scattered positions summed into the pixels of an image.
+"""Images of events: values at scattered positions summed into the pixels of an image.
 
 Positions are in index units (10.0 is the centre of pixel 10); what falls outside is dropped.
 """
@@ -44,8 +44,8 @@ def window_image(
         index: The events.
         start_us: The first instant that counts.
         end_us: The first that no longer does.
-        width: Of the picture.
-        height: Of the picture.
+        width: Of the image.
+        height: Of the image.
         track: Whose events.
     """
     site = index.sites_of(track)

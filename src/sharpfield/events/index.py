@@ -7,7 +7,7 @@ site begins. Cameras follow each other: site = track * height * width + row * wi
 "how many events between two times" is two binary searches.
 
 It is built by a counting sort: one pass over the stream counts, one places. All arrays are numpy
-and may be memory-mapped, see `ops.event_index_files`; pictures of it are in `ops.event_image`.
+and may be memory-mapped, see `ops.event_index_files`; images of it are in `ops.event_image`.
 """
 
 from dataclasses import dataclass
@@ -276,7 +276,7 @@ def _window(offset, t_us, site, start_us, end_us):
     """Both ends of many windows; a group at a time, step by step together.
 
     A binary search waits for memory at each step; the steps of a group do not depend on each
-    other, so that the processor waits for many at once (1.5 times the speed of one by one).
+    other, so that the CPU waits for many at once (1.5 times the speed of one by one).
     """
     first, last = np.empty(site.size, np.int64), np.empty(site.size, np.int64)
     found = np.empty(2 * GROUP, np.int64)

@@ -1,7 +1,7 @@
-"""Sharp pictures at any time of a capture, by the event double integral.
+"""Sharp images at any time of a capture, by the event double integral.
 
 Each exposure says how bright every pixel was on average, the events how its light moved before,
-during and after (see `formation.edi`). Inside an exposure its own picture is carried to the
+during and after (see `formation.edi`). Inside an exposure its own image is carried to the
 instant; between two exposures both are, and their log light is averaged by how near they are.
 """
 
@@ -23,7 +23,7 @@ from sharpfield.events.threshold import FixedThresholds
 
 
 @dataclass(frozen=True)
-class Belief:
+class SensorEstimate:
     """What is believed of the event camera."""
 
     negative: float
@@ -35,7 +35,7 @@ class Belief:
 
 
 class SharpInstants:
-    """Pictures between the first and the last exposure of the training frames.
+    """Images between the first and the last exposure of the training frames.
 
     Args:
         capture: With frames and events.
@@ -56,14 +56,14 @@ class SharpInstants:
             int(exposure.open_us[self.order].min()),
             int(exposure.close_us[self.order].max()),
         )
-        self._log_means: dict[tuple[int, Belief], Tensor] = {}
+        self._log_means: dict[tuple[int, SensorEstimate], Tensor] = {}
 
-    def at(self, time_us: int, belief: Belief) -> Float[Tensor, "h w c"]:
-        """The picture at a time, as the frames would store it.
+    def at(self, time_us: int, sensor_estimate: SensorEstimate) -> Float[Tensor, "h w c"]:
+        """The image at a time, as the frames would store it.
 
         Args:
             time_us: By the clock of the frames.
-            belief: In what the events say.
+            sensor_estimate: In what the events say.
         """
         exposure = self.frames.exposure
         away = np.maximum(
@@ -72,39 +72,54 @@ class SharpInstants:
         away = np.maximum(away, 0)
         nearest = [int(i) for i in np.argsort(away, kind="stable")[:2]]
         if away[nearest[0]] == 0 or len(nearest) == 1:
-            return self._developed(self._log_light(int(self.order[nearest[0]]), time_us, belief))
-        one, other = (self._log_light(int(self.order[i]), time_us, belief) for i in nearest)
+            return self._developed(
+                self._log_light(int(self.order[nearest[0]]), time_us, sensor_estimate)
+            )
+        one, other = (
+            self._log_light(int(self.order[i]), time_us, sensor_estimate) for i in nearest
+        )
         share = float(away[nearest[1]] / away[nearest].sum())
         return self._developed(share * one + (1 - share) * other)
 
     def _developed(self, log_light: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
         return self.tone.encode(log_light.exp().clamp(0, 1))
 
-    def _log_light(self, frame: int, time_us: int, belief: Belief) -> Float[Tensor, "h w c"]:
+    def _log_light(
+        self, frame: int, time_us: int, sensor_estimate: SensorEstimate
+    ) -> Float[Tensor, "h w c"]:
         """What one exposure and the events from its opening to a time say."""
         opens = int(self.frames.exposure.open_us[frame])
-        first, last = min(opens, time_us) + belief.late_us, max(opens, time_us) + belief.late_us
+        first, last = (
+            min(opens, time_us) + sensor_estimate.late_us,
+            max(opens, time_us) + sensor_estimate.late_us,
+        )
         negative, positive = counts_between(self.motion, first, last)
         if self.index is not None:
             begin, end = (ramp_at(self.index, t, self.size) for t in (first, last))
             negative = negative + (end - begin)[..., :1]
             positive = positive + (end - begin)[..., 1:]
-        change = negative * belief.negative + positive * belief.positive
+        change = negative * sensor_estimate.negative + positive * sensor_estimate.positive
         stored = torch.as_tensor(self.frames.images[frame].astype(np.float32)) / self.frames.white
         blurred = self.tone.decode(stored).clamp_min(FLOOR).log()
-        return blurred - self._log_mean(frame, belief) + (change if time_us >= opens else -change)
+        return (
+            blurred
+            - self._log_mean(frame, sensor_estimate)
+            + (change if time_us >= opens else -change)
+        )
 
-    def _log_mean(self, frame: int, belief: Belief) -> Float[Tensor, "h w c"]:
+    def _log_mean(self, frame: int, sensor_estimate: SensorEstimate) -> Float[Tensor, "h w c"]:
         """Of one exposure, relative to its opening; kept for the belief that was asked last."""
-        if (frame, belief) not in self._log_means:
+        if (frame, sensor_estimate) not in self._log_means:
             for known in [key for key in self._log_means if key[0] == frame]:
                 del self._log_means[known]
-            opens, closes = (t + belief.late_us for t in self.frames.exposure.window(frame))
+            opens, closes = (
+                t + sensor_estimate.late_us for t in self.frames.exposure.window(frame)
+            )
             if self.index is not None:
-                thresholds = belief.negative, belief.positive
+                thresholds = sensor_estimate.negative, sensor_estimate.positive
                 mean = ramped_log_mean(self.index, (opens, closes), thresholds, self.size)
             else:
-                fixed = FixedThresholds(belief.negative, belief.positive)
+                fixed = FixedThresholds(sensor_estimate.negative, sensor_estimate.positive)
                 mean = self.motion.path((opens, closes), np.array([opens]), fixed).log_mean
-            self._log_means[frame, belief] = mean.half()
-        return self._log_means[frame, belief].float()
+            self._log_means[frame, sensor_estimate] = mean.half()
+        return self._log_means[frame, sensor_estimate].float()

@@ -12,7 +12,7 @@ that explain them too large.
 The log light of every pixel as a broken line through its events, instead of a staircase.
 
 A staircase rises when a threshold is already behind, so that all it says is late, by a millisecond
-or so: pictures made from it show where things were. Between two events a *ramp* lets the light
+or so: images made from it show where things were. Between two events a *ramp* lets the light
 move in the last part of the time before the second one. Where light turns it has gone a little
 beyond its last event, see `formation.event_phase`.
 """

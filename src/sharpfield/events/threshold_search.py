@@ -4,10 +4,10 @@ Two judges say how well a threshold explains a recording; lower is better.
 
 *Disagreement*: each exposure by itself says what the light was at its middle, and so does its
 neighbour plus the events between the two. Only the right threshold makes them agree, for any
-scene that moves, without any idea of what a sharp picture looks like.
+scene that moves, without any idea of what a sharp image looks like.
 
 *Density of edges*: the mean length of the gradient over its root mean square, where events were.
-Blur and noise both fill a picture with small gradients, sharp edges are few and tall; so the number
+Blur and noise both fill a image with small gradients, sharp edges are few and tall; so the number
 balances total variation against edge strength, which is how the EDI paper chooses. It serves
 where a single frame is all there is. Alone it is easily fooled (exaggerated edges are taller
 still, and a frame with little blur says next to nothing), hence a mild pull towards the threshold
@@ -77,15 +77,15 @@ def disagreement(
 
 
 def edge_density(
-    picture: Float[Tensor, "h w 1"], where: Bool[Tensor, "h w 1"] | None = None
+    image: Float[Tensor, "h w 1"], where: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
     """Mean over root mean square of the gradient's length: 1 if everywhere alike, 0 if sparse.
 
     Args:
-        picture: Display-referred, so that edges count as they are seen.
+        image: Display-referred, so that edges count as they are seen.
         where: The pixels to look at; all by default.
     """
-    grey = picture[..., 0]
+    grey = image[..., 0]
     right, down = grey[:-1, 1:] - grey[:-1, :-1], grey[1:, :-1] - grey[:-1, :-1]
     length = (right.square() + down.square()).sqrt()
     if where is not None:

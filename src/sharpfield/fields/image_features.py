@@ -1,6 +1,6 @@
-"""What pictures of a scene show at places in it, and how it joins what the places know themselves.
+"""What images of a scene show at places in it, and how it joins what the places know themselves.
 
-Every *source*, a picture with a known pose, is turned into *levels*: the picture itself, and three
+Every *source*, a image with a known pose, is turned into *levels*: the image itself, and three
 maps of features at a half, a quarter and an eighth of its size. A place is looked up in each; what
 several sources say of it is *merged* by learned weights, and a residual network *mixes* the result
 into the place's own feature.
@@ -26,7 +26,7 @@ class FeatureExtractor(nn.Module):
     """Two small convolutions for each map, the first of which halves the size.
 
     Args:
-        colours: Channels of a picture, 1 or 3.
+        colours: Channels of a image, 1 or 3.
         seed: Of the run.
     """
 
@@ -45,10 +45,10 @@ class FeatureExtractor(nn.Module):
             self.stages.append(stage)
             inputs = outputs
 
-    def forward(self, pictures: Float[Tensor, "n h w c"]) -> list[Float[Tensor, "n _h _w _f"]]:
-        """The pictures and their three maps, channels last."""
-        levels = [pictures]
-        image = pictures.movedim(-1, 1)
+    def forward(self, images: Float[Tensor, "n h w c"]) -> list[Float[Tensor, "n _h _w _f"]]:
+        """The images and their three maps, channels last."""
+        levels = [images]
+        image = images.movedim(-1, 1)
         for stage in self.stages:
             assert isinstance(stage, nn.ModuleList)
             for one in stage:
@@ -86,7 +86,7 @@ class Merging(nn.Module):
             shown: By each source.
             feature: Of each place.
             change: Unit direction from the source to the place, minus that of the ray.
-            visible: Factor on the weights; 0 outside of a picture.
+            visible: Factor on the weights; 0 outside of a image.
         """
         own = self.network.first(feature, skipped=shown.shape[-1])  # once for all sources
         both = self.network.first(shown) + own[:, None]
@@ -115,6 +115,6 @@ class Mixing(nn.Module):
     def forward(
         self, feature: Float[Tensor, "n r"], merged: Float[Tensor, "n f"]
     ) -> Float[Tensor, "n r"]:
-        """The feature with what pictures know of it."""
+        """The feature with what images know of it."""
         first, others = feature[:, : self.looked], feature[:, self.looked :]
         return torch.cat([first + self.network(first, merged.to(first.dtype)), others], -1)

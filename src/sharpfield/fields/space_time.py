@@ -1,6 +1,6 @@
 """A field over space and time without networks: voxels that stand still and voxels that move.
 
-It learns in minutes on a processor. What stands still is a dense grid, as in `fields.voxel_grid`;
+It learns in minutes on a CPU. What stands still is a dense grid, as in `fields.voxel_grid`;
 what moves is the same at a number of moments, for those cells where something can move. Both add
 up before the activations, each with a grid of few cells that many rays pass.
 

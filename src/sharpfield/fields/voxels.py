@@ -1,6 +1,6 @@
 """A field without networks: density and colour in a dense grid of voxels.
 
-It learns in a minute on a processor what networks learn in an hour, and costs memory instead: no
+It learns in a minute on a CPU what networks learn in an hour, and costs memory instead: no
 detail finer than a voxel, and no colour that changes with the direction.
 
 Source: direct voxel grids, DVGO (CVPR 2022) and Plenoxels (CVPR 2022).

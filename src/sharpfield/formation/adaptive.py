@@ -37,7 +37,7 @@ OCTAVES = 2
 """Of the encoding of the ray's direction."""
 
 CPU_CHUNK, CHUNK = 1 << 14, 1 << 19
-"""Samples embedded at once: few enough for a processor's cache, or enough to fill a GPU."""
+"""Samples embedded at once: few enough for a CPU's cache, or enough to fill a GPU."""
 
 
 class AdaptiveWeights(nn.Module):

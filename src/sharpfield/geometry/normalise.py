@@ -16,8 +16,8 @@ from jaxtyping import Float
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.space import Similarity, normalisation
 from sharpfield.geometry.trajectory import (
+    LearnedExposureMotion,
     LearnedKnots,
-    LearnedShake,
     Moved,
     Stamped,
     Tracks,
@@ -108,7 +108,7 @@ def change_of(capture: Capture) -> Similarity:
     where a model lives.
     """
     path: object = capture.trajectory
-    while isinstance(path, LearnedKnots | LearnedShake):
+    while isinstance(path, LearnedKnots | LearnedExposureMotion):
         path = path.base
     if isinstance(path, Moved):
         return path.change

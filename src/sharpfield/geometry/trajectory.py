@@ -288,7 +288,7 @@ def count_tracks(path: Trajectory) -> int:
             return 1
 
 
-class LearnedShake(nn.Module):
+class LearnedExposureMotion(nn.Module):
     """A trajectory whose tracks are photos, each with a learned motion while its shutter is open.
 
     The motion is a cubic B-spline of twists in camera axes over the exposure; outside of it the

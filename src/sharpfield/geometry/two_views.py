@@ -28,7 +28,7 @@ LEAST_MATCHES = 16
 
 @dataclass(frozen=True)
 class Details:
-    """Features of one picture."""
+    """Features of one image."""
 
     xy: Float64[np.ndarray, "m 2"]
     """In px, the centre of the first one at 0.5."""
@@ -37,25 +37,25 @@ class Details:
 
 @dataclass(frozen=True)
 class PairMatches:
-    """What two pictures both show."""
+    """What two images both show."""
 
     pair: tuple[int, int]
     xy: Float64[np.ndarray, "m 2 2"]
-    """In the first and in the second picture."""
+    """In the first and in the second image."""
 
     def __len__(self) -> int:
         """How many details."""
         return len(self.xy)
 
 
-def find_details(pictures: UInt8[np.ndarray, "n h w c"]) -> list[Details]:
-    """Features of each picture."""
+def find_details(images: UInt8[np.ndarray, "n h w c"]) -> list[Details]:
+    """Features of each image."""
     sift = cv2.SIFT_create(  # pyright: ignore
         MOST_FEATURES, contrastThreshold=FAINTEST, enable_precise_upscale=True
     )
     found = []
-    for picture in pictures:
-        grey = np.ascontiguousarray(picture.mean(-1).round().astype(np.uint8))
+    for image in images:
+        grey = np.ascontiguousarray(image.mean(-1).round().astype(np.uint8))
         points, about = sift.detectAndCompute(grey, None)
         xy = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
         about = np.zeros((0, 128), np.float32) if about is None else about
@@ -130,7 +130,7 @@ def depths_of(
 
 
 def pairs_apart(poses: Float64[np.ndarray, "n 3 4"], *, most: int) -> list[tuple[int, int]]:
-    """Pairs of pictures with clear parallax: of each, the ones at middling distance."""
+    """Pairs of images with clear parallax: of each, the ones at middling distance."""
     centre = poses[:, :, 3]
     away = np.linalg.norm(centre[:, None] - centre, axis=-1)
     first, second = np.triu_indices(len(poses), 1)

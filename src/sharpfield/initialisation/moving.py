@@ -1,7 +1,7 @@
 """Where the Gaussians of a moving scene start: what stands still, and what moves.
 
 Cameras that stand still see the *backdrop*: what they see most of the time, at each pixel. From
-these pictures the still Gaussians start. The moving ones fill the *hull* of each moment: places
+these images the still Gaussians start. The moving ones fill the *hull* of each moment: places
 that nearly all of these cameras see in *busy* pixels, where there are events, or where a frame
 differs from the backdrop
 (compare `initialisation/visual_hull.py`, which asks the same of the whole recording).
@@ -25,7 +25,7 @@ from sharpfield.events.index import EventIndex
 from sharpfield.fields.gaussians.dynamic import MovingGaussians
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry.trajectory import count_tracks
-from sharpfield.initialisation.posed_images import Pictures
+from sharpfield.initialisation.posed_images import Images
 from sharpfield.initialisation.start_points import starting_points
 
 GREY = 0.2
@@ -78,9 +78,9 @@ def still_start(
         opacity: Of each.
     """
     made = generator(seed, 0, "still")
-    pictures = backdrop(capture)
+    images = backdrop(capture)
     known = np.zeros((0, 3)) if capture.frames is None else capture.points
-    start = starting_points(pictures, count, made, known=known, size=size)
+    start = starting_points(images, count, made, known=known, size=size)
     return Gaussians.start(
         torch.from_numpy(start.points),
         tone.encode(torch.from_numpy(start.colours)),
@@ -90,14 +90,14 @@ def still_start(
     )
 
 
-def backdrop(capture: Capture) -> Pictures:
+def backdrop(capture: Capture) -> Images:
     """What stands still: the median of each still camera's frames, and frames of moving ones."""
     camera, path = capture.camera, capture.trajectory
     if capture.frames is None:
         track = torch.arange(count_tracks(path))
         poses = path.pose(torch.full((len(track),), 0.5), track).detach().double().numpy()
         light = np.full((len(track), camera.height, camera.width, 1), GREY, np.float32)
-        return Pictures(camera, light, poses, capture.near, capture.far)
+        return Images(camera, light, poses, capture.near, capture.far)
     frames, train = capture.frames, capture.split.train
     stored, chosen = [], []
     for track in np.unique(frames.track[train]):
@@ -112,7 +112,7 @@ def backdrop(capture: Capture) -> Pictures:
     values = torch.from_numpy(np.stack(stored)).float() / frames.white
     poses = capture.frame_pose(np.array(chosen)).detach().double().numpy()
     light = tone_of(frames.encoding).decode(values).numpy()
-    return Pictures(camera, light, poses, capture.near, capture.far)
+    return Images(camera, light, poses, capture.near, capture.far)
 
 
 def usual_colour(capture: Capture, tone: Tone) -> Float[Tensor, "c"]:

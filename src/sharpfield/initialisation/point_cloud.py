@@ -13,12 +13,12 @@ from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.initialisation.fused_points import fuse_points
-from sharpfield.initialisation.posed_images import sharp_pictures
+from sharpfield.initialisation.posed_images import sharp_images
 from sharpfield.initialisation.start_points import starting_points
 from sharpfield.storage.result_cache import kept
 
 PAIRS = 1 << 20
-"""Of points and cameras, looked at at once: few enough to stay close to the processor."""
+"""Of points and cameras, looked at at once: few enough to stay close to the CPU."""
 
 FAR_OFF = 200.0
 """World units that count as much as a right angle to the axis, when a camera is chosen."""
@@ -222,8 +222,8 @@ def _guessed(
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n c"]]:
     """Pixels drawn by chance, as deep as a sparse cloud around them."""
     tone = tone_of(capture.needed_frames.encoding)
-    pictures = sharp_pictures(capture.without(events=True), FixedThresholds(1.0, 1.0))
+    images = sharp_images(capture.without(events=True), FixedThresholds(1.0, 1.0))
     count = options.budget or GUESSED
     made = generator(seed, 0, "cloud")
-    start = starting_points(pictures, count, made, known=capture.points)
+    start = starting_points(images, count, made, known=capture.points)
     return start.points, tone.encode(torch.from_numpy(start.colours)).clamp(0, 1).numpy()

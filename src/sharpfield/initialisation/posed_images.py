@@ -1,4 +1,4 @@
-"""Sharp pictures of a scene, and where each was taken from: what a sparse cloud is made from."""
+"""Sharp images of a scene, and where each was taken from: what a sparse cloud is made from."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,13 +16,13 @@ from sharpfield.events.edi import latent
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 
-MOST_PICTURES = 200
+MOST_IMAGES = 200
 """Full precision takes 4 bytes a value: these are 0.7 GB at 640x480."""
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """Pictures of one camera and their poses."""
+class Images:
+    """Images of one camera and their poses."""
 
     camera: Camera
     light: Float[np.ndarray, "n h w c"]
@@ -37,14 +37,14 @@ class Pictures:
         return len(self.light)
 
     def directions(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m 3"]:
-        """Unit directions, in the world, seen by pixels of a picture."""
+        """Unit directions, in the world, seen by pixels of a image."""
         ray = self.camera.direction(torch.from_numpy(xy.astype(np.float64))).numpy()
         return ray @ self.poses[view, :, :3].T
 
     def project(
         self, points: Float[np.ndarray, "m 3"], view: int
     ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-        """Pixels of points in a picture, and their depth along its axis.
+        """Pixels of points in a image, and their depth along its axis.
 
         Points less than half as far as the nearest depth get the depth -1 and no pixel.
         """
@@ -57,23 +57,23 @@ class Pictures:
         return xy, np.where(ahead, depth, -1.0)
 
     def inside(self, xy: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, "m"]:
-        """Which positions are on the picture."""
+        """Which positions are on the image."""
         x, y = xy.T
         return (x >= 0) & (x < self.camera.width) & (y >= 0) & (y < self.camera.height)
 
     def look(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m c"]:
-        """Light of the pixels of a picture that hold some positions."""
+        """Light of the pixels of a image that hold some positions."""
         x, y = np.minimum(xy.astype(np.int64), np.array(self.camera.size) - 1).T
         return self.light[view, y, x]
 
 
-def sharp_pictures(
-    capture: Capture, thresholds: FixedThresholds, *, most: int = MOST_PICTURES
-) -> Pictures:
+def sharp_images(
+    capture: Capture, thresholds: FixedThresholds, *, most: int = MOST_IMAGES
+) -> Images:
     """The frames to learn from: deblurred to the middle of their exposure where events tell how.
 
     Args:
-        capture: With frames, in the space that the pictures are to have.
+        capture: With frames, in the space that the images are to have.
         thresholds: Of the events, if there are any.
         most: Of a long capture, so many frames spread over it.
 
@@ -82,25 +82,25 @@ def sharp_pictures(
     """
     frames, chosen = capture.needed_frames, evenly_spread(capture.split.train, most)
     light = np.empty((len(chosen), *frames.images.shape[1:]), np.float32)
-    for view, picture in enumerate(sharp_light(capture, thresholds, chosen)):
-        light[view] = picture.numpy()
+    for view, image in enumerate(sharp_light_images(capture, thresholds, chosen)):
+        light[view] = image.numpy()
     poses = capture.frame_pose(chosen).detach().double().numpy()
-    return Pictures(capture.camera, light, poses, capture.near, capture.far)
+    return Images(capture.camera, light, poses, capture.near, capture.far)
 
 
-def sharp_light(
+def sharp_light_images(
     capture: Capture, thresholds: FixedThresholds, chosen: Int64[np.ndarray, "m"]
 ) -> Iterator[Float[Tensor, "h w c"]]:
-    """The linear light of some frames, one after the other, see `sharp_pictures`."""
+    """The linear light of some frames, one after the other, see `sharp_images`."""
     frames = capture.needed_frames
     tone = tone_of(frames.encoding)
     blurred = not frames.exposure.instant[chosen].all()
     motion = EventMotion.of(capture) if blurred and capture.events is not None else None
     for i in chosen:
         stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
-        picture = tone.decode(stored)
+        image = tone.decode(stored)
         if motion is not None and not frames.exposure.instant[i]:
             middle = frames.exposure.middle_us[i : i + 1]
             path = motion.path(frames.exposure.window(int(i)), middle, thresholds)
-            picture = latent(picture, path, 0)
-        yield picture.clamp(0, 1)
+            image = latent(image, path, 0)
+        yield image.clamp(0, 1)

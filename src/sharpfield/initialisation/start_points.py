@@ -1,7 +1,7 @@
-"""Where Gaussians start: near the surfaces, as well as pictures with known poses can tell.
+"""Where Gaussians start: near the surfaces, as well as images with known poses can tell.
 
-A sparse *cloud* comes with the capture or is triangulated from the pictures. What is left of the
-budget are pixels drawn by chance from the pictures and put at a depth like that of the cloud
+A sparse *cloud* comes with the capture or is triangulated from the images. What is left of the
+budget are pixels drawn by chance from the images and put at a depth like that of the cloud
 around them; a few of them, or all where there is no cloud, anywhere between near and far.
 """
 
@@ -12,14 +12,14 @@ import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Generator
 
-from sharpfield.initialisation.posed_images import Pictures
+from sharpfield.initialisation.posed_images import Images
 from sharpfield.initialisation.triangulation import Cloud, triangulate
 
 BLIND = 0.05
 """Part of the drawn pixels whose depth is guessed even where there is a cloud."""
 
 NEIGHBOURS = 4
-"""Points of the cloud, as seen in the picture, whose median gives the depth of a pixel."""
+"""Points of the cloud, as seen in the image, whose median gives the depth of a pixel."""
 
 SPREAD = 0.02
 """Least spread of that depth, relative to its inverse; the neighbours' own comes on top."""
@@ -33,11 +33,11 @@ class StartPoints:
     colours: Float32[np.ndarray, "n c"]
     """Linear light."""
     sizes: Float32[np.ndarray, "n"]
-    """In world units, so that all together fill a picture."""
+    """In world units, so that all together fill a image."""
 
 
 def starting_points(
-    pictures: Pictures,
+    images: Images,
     count: int,
     generator: Generator,
     *,
@@ -47,27 +47,27 @@ def starting_points(
     """Points near the surfaces of a scene.
 
     Args:
-        pictures: Sharp ones, at least one.
+        images: Sharp ones, at least one.
         count: How many points.
         generator: On the CPU; decides which pixels are drawn.
         known: A sparse cloud, where there is one.
-        size: Of each point, relative to the distance of its neighbours in a picture.
+        size: Of each point, relative to the distance of its neighbours in a image.
     """
-    cloud = triangulate(pictures) if known is None else _shown(pictures, known)
+    cloud = triangulate(images) if known is None else _shown(images, known)
     if len(cloud.points) > count:
         chosen = torch.randperm(len(cloud.points), generator=generator)[:count].numpy()
         cloud = cloud[chosen]
-    drawn, colours, depth = _drawn(pictures, cloud, count - len(cloud.points), generator)
+    drawn, colours, depth = _drawn(images, cloud, count - len(cloud.points), generator)
     points = np.concatenate([cloud.points, drawn])
     nearest = np.full(len(cloud.points), np.inf)
     shown = 0
-    for view in range(len(pictures)):
-        xy, away = pictures.project(points, view)
-        shown += int((pictures.inside(xy) & (away > 0)).sum())
+    for view in range(len(images)):
+        xy, away = images.project(points, view)
+        shown += int((images.inside(xy) & (away > 0)).sum())
         seen = cloud.seen[view]
         nearest[seen] = np.minimum(nearest, away[: len(nearest)])[seen]
-    camera = pictures.camera
-    apart_px = np.sqrt(camera.width * camera.height * len(pictures) / max(shown, 1))
+    camera = images.camera
+    apart_px = np.sqrt(camera.width * camera.height * len(images) / max(shown, 1))
     sizes = size * apart_px * np.concatenate([nearest, depth]) / camera.fx_px
     return StartPoints(
         points.astype(np.float32),
@@ -76,57 +76,57 @@ def starting_points(
     )
 
 
-def _shown(pictures: Pictures, points: Float[np.ndarray, "m 3"]) -> Cloud:
-    """Known points that some picture shows; where one hides another is not known."""
-    seen = np.zeros((len(pictures), len(points)), bool)
-    shown = np.full((*seen.shape, pictures.light.shape[-1]), np.nan)
-    for view in range(len(pictures)):
-        xy, depth = pictures.project(points, view)
-        seen[view] = pictures.inside(xy) & (depth > 0)
-        shown[view, seen[view]] = pictures.look(xy[seen[view]], view)
+def _shown(images: Images, points: Float[np.ndarray, "m 3"]) -> Cloud:
+    """Known points that some image shows; where one hides another is not known."""
+    seen = np.zeros((len(images), len(points)), bool)
+    shown = np.full((*seen.shape, images.light.shape[-1]), np.nan)
+    for view in range(len(images)):
+        xy, depth = images.project(points, view)
+        seen[view] = images.inside(xy) & (depth > 0)
+        shown[view, seen[view]] = images.look(xy[seen[view]], view)
     some = seen.any(0)
-    colours = np.nanmedian(shown[:, some], 0)  # most pictures do not show what hides a point
+    colours = np.nanmedian(shown[:, some], 0)  # most images do not show what hides a point
     return Cloud(points[some], colours, seen[:, some], np.zeros(int(some.sum())))
 
 
 def _drawn(
-    pictures: Pictures, cloud: Cloud, count: int, generator: Generator
+    images: Images, cloud: Cloud, count: int, generator: Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n c"], Float[np.ndarray, "n"]]:
     """Pixels drawn by chance, as points with their colour and depth."""
     chance = torch.rand(count, 5, generator=generator, dtype=torch.float64).numpy()
     normal = torch.randn(count, generator=generator, dtype=torch.float64).numpy()
-    views = (chance[:, 0] * len(pictures)).astype(np.int64)
-    xy = chance[:, 1:3] * pictures.camera.size
-    nearest, farthest = 1 / pictures.near, 1 / pictures.far
+    views = (chance[:, 0] * len(images)).astype(np.int64)
+    xy = chance[:, 1:3] * images.camera.size
+    nearest, farthest = 1 / images.near, 1 / images.far
     inverse = farthest + (nearest - farthest) * chance[:, 3]
     points = np.zeros((count, 3))
-    colours = np.zeros((count, pictures.light.shape[-1]))
-    for view in range(len(pictures)):
+    colours = np.zeros((count, images.light.shape[-1]))
+    for view in range(len(images)):
         here = np.flatnonzero(views == view)
-        colours[here] = pictures.look(xy[here], view)
+        colours[here] = images.look(xy[here], view)
         told = here[chance[here, 4] >= BLIND]
-        found = _told(pictures, cloud, view, xy[told])
+        found = _told(images, cloud, view, xy[told])
         if found is not None:
             middle, spread = found
             guess = middle + (spread + SPREAD * middle) * normal[told]
             inverse[told] = np.clip(guess, farthest, nearest)
-        pose = pictures.poses[view]
-        ray = pictures.directions(xy[here], view)
+        pose = images.poses[view]
+        ray = images.directions(xy[here], view)
         along = 1 / (inverse[here] * np.maximum(ray @ pose[:, 2], 1e-3))
         points[here] = pose[:, 3] + along[:, None] * ray
     return points, colours, 1 / inverse
 
 
 def _told(
-    pictures: Pictures, cloud: Cloud, view: int, xy: Float[np.ndarray, "m 2"]
+    images: Images, cloud: Cloud, view: int, xy: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]] | None:
-    """Inverse depth at pixels of a picture as the cloud tells, and its spread; None if it cannot.
+    """Inverse depth at pixels of a image as the cloud tells, and its spread; None if it cannot.
 
-    Points hidden in this picture tell the wrong depth; if it shows too few for sure, all count
+    Points hidden in this image tell the wrong depth; if it shows too few for sure, all count
     that project into it.
     """
-    where, depth = pictures.project(cloud.points, view)
-    usable = pictures.inside(where) & (depth > 0)
+    where, depth = images.project(cloud.points, view)
+    usable = images.inside(where) & (depth > 0)
     sure = np.flatnonzero(usable & cloud.seen[view])
     rows = sure if len(sure) >= NEIGHBOURS else np.flatnonzero(usable)
     if len(rows) < NEIGHBOURS:

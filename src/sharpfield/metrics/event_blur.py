@@ -1,8 +1,8 @@
 """How far things moved while a frame was exposed, measured from events: its blur, in px.
 
 Within a short part of an exposure a point moves a little, and the light of a pixel changes by the
-slope of the picture times the shift: change = -slope . shift. Events are that change. The slope is
-that of the sharp picture at the time, which the event double integral gives from the blurred frame
+slope of the image times the shift: change = -slope . shift. Events are that change. The slope is
+that of the sharp image at the time, which the event double integral gives from the blurred frame
 and the events. So shifts follow, block by block, by least squares; the sum of their lengths over
 the exposure is the *travel*, and the blur of a frame is the mean over its blocks. No depth, no
 poses, no other frame.
@@ -22,13 +22,13 @@ from sharpfield.core.errors import CaptureError
 PARTS = 16
 """Parts of an exposure."""
 BLOCKS = 6
-"""Blocks along the shorter side of the picture."""
+"""Blocks along the shorter side of the image."""
 DARK = 0.02
 """Added to light before logarithms, as a share of white."""
 SMOOTHING_PX = 1.0
 """Standard deviation of the blur that slopes and changes are looked at through."""
 HOLD = 0.05
-"""Pull of a block's shift towards that of the whole picture, as a share of the mean slope."""
+"""Pull of a block's shift towards that of the whole image, as a share of the mean slope."""
 
 
 def event_blur(

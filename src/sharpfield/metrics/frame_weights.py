@@ -9,14 +9,14 @@ from sharpfield.core.capture import Capture
 from sharpfield.metrics.quality import quality, quality_weights
 from sharpfield.storage.result_cache import kept
 
-Judge = Literal["published", "auto", "pictures", "events"]
-"""As published; by events where there are any, else by pictures; by pictures; by events."""
+Judge = Literal["published", "auto", "images", "events"]
+"""As published; by events where there are any, else by images; by images; by events."""
 
 
 def frame_weights(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
     """A weight for each frame: about 1 on average over those learned from, and 1 for the others.
 
-    What pictures tell about long captures is kept, see `captures.kept`.
+    What images tell about long captures is kept, see `captures.kept`.
 
     Raises:
         CaptureError: Events are to tell, and there are none.
@@ -31,7 +31,7 @@ def frame_weights(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
 
 def _seen(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
     if judge != "published":
-        return quality_weights(capture, source="pictures")
+        return quality_weights(capture, source="images")
     weights = np.ones(len(capture.needed_frames))
     found = quality(capture, way="published")
     weights[found.frames] = found.weights

@@ -1,19 +1,19 @@
-"""How alike two pictures are: PSNR, and SSIM in the definitions that papers print.
+"""How alike two images are: PSNR, and SSIM in the definitions that papers print.
 
-All functions take pictures `[h w c]` with values 0...1 in the display domain (as files store
+All functions take images `[h w c]` with values 0...1 in the display domain (as files store
 them), compare them channel by channel, and compute in float64. SSIM comes in three settings that
-give *different numbers for the same pictures*, so a table has to say which one it shows:
+give *different numbers for the same images*, so a table has to say which one it shows:
 
 - `ssim`: the definition of Wang et al. 2004: a Gaussian window of 11x11 with sigma 1.5,
   population covariance, data range 1.
 - `ssim_uniform`: scikit-image's default: a uniform window of 7x7, sample covariance, range 1.
 - `ssim_paper`: the numbers printed by NeRF deblurring papers (Deblur-NeRF, DP-NeRF, PDRF,
-  Ev-DeblurNeRF): as `ssim_uniform`, but of pictures mapped to -1...1 with range 2. Local means then
+  Ev-DeblurNeRF): as `ssim_uniform`, but of images mapped to -1...1 with range 2. Local means then
   lie around zero, and its luminance term punishes grey regions; it is often much lower.
 
-How sharp a picture is, without another to compare it to.
+How sharp a image is, without another to compare it to.
 
-Both numbers grow with contrast and noise as well as with sharpness, so they order pictures of the
+Both numbers grow with contrast and noise as well as with sharpness, so they order images of the
 same scene under the same light, and mean nothing on their own.
 
 How well predicted events match measured ones, by their numbers at each pixel.
@@ -25,36 +25,36 @@ from torch import Tensor
 
 from sharpfield.core.errors import ShapeError
 
-Picture = Float[Tensor, "h w c"]
+Image = Float[Tensor, "h w c"]
 
 K1, K2 = 0.01, 0.03
 GAUSSIAN_WINDOW, GAUSSIAN_SIGMA = 11, 1.5
 UNIFORM_WINDOW = 7
 
 
-def psnr(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal pictures."""
+def psnr(predicted: Image, truth: Image) -> Float[Tensor, ""]:
+    """Peak signal-to-noise ratio in dB for a peak of 1; infinite for equal images."""
     _same_shape(predicted, truth)
     return -10 * (predicted.double() - truth.double()).square().mean().log10()
 
 
-def ssim(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+def ssim(predicted: Image, truth: Image) -> Float[Tensor, ""]:
     """Structural similarity with a Gaussian window, as defined by its authors.
 
     Source: Wang, Bovik, Sheikh, Simoncelli, "Image quality assessment: from error visibility to
-    structural similarity", IEEE TIP 2004. Windows lie wholly inside the picture.
+    structural similarity", IEEE TIP 2004. Windows lie wholly inside the image.
     """
     offset = torch.arange(GAUSSIAN_WINDOW, dtype=torch.float64) - GAUSSIAN_WINDOW // 2
     window = (-0.5 * (offset / GAUSSIAN_SIGMA).square()).exp()
     return _ssim(predicted, truth, window / window.sum(), unbiased=1.0, data_range=1.0)
 
 
-def ssim_uniform(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+def ssim_uniform(predicted: Image, truth: Image) -> Float[Tensor, ""]:
     """Structural similarity with scikit-image's default window, on 0...1."""
     return _ssim(predicted, truth, *_uniform(), data_range=1.0)
 
 
-def ssim_paper(predicted: Picture, truth: Picture) -> Float[Tensor, ""]:
+def ssim_paper(predicted: Image, truth: Image) -> Float[Tensor, ""]:
     """Structural similarity as the papers on deblurring radiance fields print it."""
     return _ssim(predicted * 2 - 1, truth * 2 - 1, *_uniform(), data_range=2.0)
 
@@ -67,8 +67,8 @@ def _uniform() -> tuple[Float[Tensor, "t"], float]:
 
 
 def _ssim(
-    predicted: Picture,
-    truth: Picture,
+    predicted: Image,
+    truth: Image,
     window: Float[Tensor, "t"],
     unbiased: float,
     *,
@@ -78,7 +78,7 @@ def _ssim(
     _same_shape(predicted, truth)
     if min(truth.shape[:2]) < len(window):
         raise ShapeError(
-            "picture is smaller than the window of SSIM",
+            "image is smaller than the window of SSIM",
             got=f"{truth.shape[1]}x{truth.shape[0]} pixels, window {len(window)}",
             do="evaluate at a larger size",
         )
@@ -94,18 +94,18 @@ def _ssim(
     return (luminance * structure).mean()
 
 
-def _blur(picture: Picture, window: Float[Tensor, "t"]) -> Float[Tensor, "y x c"]:
+def _blur(image: Image, window: Float[Tensor, "t"]) -> Float[Tensor, "y x c"]:
     """Separable weighted mean over windows that fit inside."""
-    layers = picture.permute(2, 0, 1)[:, None]  # [c, 1, h, w]
+    layers = image.permute(2, 0, 1)[:, None]  # [c, 1, h, w]
     layers = torch.nn.functional.conv2d(layers, window[None, None, :, None])
     layers = torch.nn.functional.conv2d(layers, window[None, None, None, :])
     return layers[:, 0].permute(1, 2, 0)
 
 
-def _same_shape(predicted: Picture, truth: Picture) -> None:
+def _same_shape(predicted: Image, truth: Image) -> None:
     if predicted.shape != truth.shape:
         raise ShapeError(
-            "pictures to compare have different shapes",
+            "images to compare have different shapes",
             got=f"{tuple(predicted.shape)} and {tuple(truth.shape)}",
         )
 
@@ -113,27 +113,27 @@ def _same_shape(predicted: Picture, truth: Picture) -> None:
 REC601 = (0.299, 0.587, 0.114)
 
 
-def luma(picture: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+def luma(image: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
     """Brightness of display values: Rec. 601 for three channels, the channel itself for one."""
-    if picture.shape[-1] == 1:
-        return picture[..., 0]
-    return picture @ picture.new_tensor(REC601)
+    if image.shape[-1] == 1:
+        return image[..., 0]
+    return image @ image.new_tensor(REC601)
 
 
-def laplacian_variance(picture: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+def laplacian_variance(image: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
     """Variance of the Laplacian (four neighbours) of the luma, inside the border.
 
     Source: Pech-Pacheco et al., "Diatom autofocusing in brightfield microscopy", ICPR 2000.
     """
-    grey = luma(picture).double()
+    grey = luma(image).double()
     middle = grey[1:-1, 1:-1]
     laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * middle
     return laplacian.var(correction=0)
 
 
-def gradient_energy(picture: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
+def gradient_energy(image: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
     """Mean squared length of the gradient of the luma, per pixel, by forward differences."""
-    grey = luma(picture).double()
+    grey = luma(image).double()
     right = grey[:-1, 1:] - grey[:-1, :-1]
     down = grey[1:, :-1] - grey[:-1, :-1]
     return torch.mean(right.square() + down.square())

@@ -1,4 +1,4 @@
-"""LPIPS v0.1: distance of two pictures in the features of a network trained on ImageNet.
+"""LPIPS v0.1: distance of two images in the features of a network trained on ImageNet.
 
 The graph is written out here; the weights are the user's to bring, since they come with terms of
 their own: the backbone as torchvision publishes it (`alexnet-owt-7be5be79.pth` or
@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from sharpfield.core.errors import OptionError, ShapeError
 
-# Mean and deviation of ImageNet, on pictures in -1...1.
+# Mean and deviation of ImageNet, on images in -1...1.
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 SMALL = 1e-10
@@ -77,7 +77,7 @@ SMALLEST_PX = {"alex": 31, "vgg": 16}
 
 @dataclass(frozen=True)
 class Lpips:
-    """Perceptual distance of two pictures, with its weights; 0 for equal pictures."""
+    """Perceptual distance of two images, with its weights; 0 for equal images."""
 
     network: str
     kernels: tuple[tuple[Tensor, Tensor], ...]
@@ -91,17 +91,17 @@ class Lpips:
     def __call__(
         self, predicted: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
     ) -> Float[Tensor, ""]:
-        """Distance of two pictures in 0...1, display domain.
+        """Distance of two images in 0...1, display domain.
 
         Raises:
-            ShapeError: The pictures are too small for the network.
+            ShapeError: The images are too small for the network.
         """
         smallest = SMALLEST_PX[self.network]
         if min(truth.shape[:2]) < smallest:
             raise ShapeError(
-                f"LPIPS ({self.network}) needs pictures of at least {smallest} px a side",
+                f"LPIPS ({self.network}) needs images of at least {smallest} px a side",
                 got=f"{truth.shape[1]}x{truth.shape[0]}",
-                do="leave LPIPS out for such small pictures",
+                do="leave LPIPS out for such small images",
             )
         total = predicted.new_zeros(())
         pairs = zip(self._unit_features(predicted), self._unit_features(truth), strict=True)
@@ -110,10 +110,10 @@ class Lpips:
             total = total + (weight[:, None, None] * difference).sum(0).mean()
         return total
 
-    def _unit_features(self, picture: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "c y x"]]:
+    def _unit_features(self, image: Float[Tensor, "h w 3"]) -> list[Float[Tensor, "c y x"]]:
         """Features after each tapped layer, of length one at every position."""
-        shift, scale = picture.new_tensor(SHIFT), picture.new_tensor(SCALE)
-        x = ((picture * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
+        shift, scale = image.new_tensor(SHIFT), image.new_tensor(SCALE)
+        x = ((image * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
         found = []
         for layer, (weight, bias) in zip(BACKBONES[self.network], self.kernels, strict=True):
             if layer.pool:

@@ -1,6 +1,6 @@
 """How well an estimated trajectory matches a known one.
 
-Poses are world-from-camera `[n 3 4]`. An estimate from pictures alone is known only up to a
+Poses are world-from-camera `[n 3 4]`. An estimate from images alone is known only up to a
 similarity (Sim(3)); `align` finds the one that brings the camera centres together.
 
 Source: Umeyama, "Least-squares estimation of transformation parameters between two point

@@ -1,6 +1,6 @@
 """How sharp the frames of a video are, told apart from what they show; and what weight that earns.
 
-The *response* of a picture says how it bends: second derivatives of its local mean. Their variance
+The *response* of a image says how it bends: second derivatives of its local mean. Their variance
 falls with blur, but also differs from place to place. So two frames are compared only where they
 show the same (their *overlap*), and comparisons of neighbours are put together to one *score* for
 each frame. Scores are relative: their unit means nothing. *Weights* compare a frame with those
@@ -11,7 +11,7 @@ the numbers. There, the response is a Laplacian, overlaps come from learned opti
 is compared with the next, and ratios are multiplied along the video (`chained`), which drifts. Here
 (`reconciled`), the response is looked at across and down, since shake blurs one way; overlaps come
 from depth where it is known, else from DIS flow; and comparisons with several neighbours, and
-faintly with the picture's own variance, are brought to agree.
+faintly with the image's own variance, are brought to agree.
 """
 
 from collections import deque
@@ -30,7 +30,7 @@ from sharpfield.metrics.event_blur import event_blur
 from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
 
 WIDTH = 640
-"""Pictures are compared at this width, in px."""
+"""Images are compared at this width, in px."""
 SMOOTHED, SMOOTHED_PUBLISHED = 3, 5
 """Side of the mean filter, in px."""
 WINDOW, STRIDE = 10, 5
@@ -38,25 +38,25 @@ WINDOW, STRIDE = 10, 5
 NEIGHBOURS = 4
 """Each frame is compared with so many after it."""
 ANCHORS = {"depth": 0.05, "flow": 0.2}
-"""How much a picture's own variance counts against one comparison; flow errs more than depth."""
+"""How much a image's own variance counts against one comparison; flow errs more than depth."""
 LEAST_SHARE = 0.02
-"""Comparisons over a smaller share of the picture are left out."""
+"""Comparisons over a smaller share of the image are left out."""
 TINY = 1e-9
 
 Means = Literal["auto", "depth", "flow"]
 """Where overlaps come from; "auto" takes depth where the capture has it."""
 Way = Literal["reconciled", "published"]
-Source = Literal["auto", "pictures", "events"]
+Source = Literal["auto", "images", "events"]
 """What tells how sharp a frame is; "auto" takes events where the capture has them."""
 SOFTEST_PX = 0.5
 """Blur that no lens or pixel is without: added to the measured one."""
 
 
-Picture = UInt8[np.ndarray, "h w"]
+Image = UInt8[np.ndarray, "h w"]
 Response = Float32[np.ndarray, "h w"]
 Responses = Sequence[Response] | Mapping[int, Response]
-Seen = Callable[[int, int, Picture, Picture], Overlap]
-"""What two frames, given by their positions and pictures, both show."""
+Seen = Callable[[int, int, Image, Image], Overlap]
+"""What two frames, given by their positions and images, both show."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Comparison:
     first: float
     second: float
     share: float
-    """How much of the picture both show."""
+    """How much of the image both show."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def quality(
     overlap: Means = "auto",
     way: Way = "reconciled",
 ) -> Quality:
-    """Scores and weights of frames, judged by their pictures.
+    """Scores and weights of frames, judged by their images.
 
     Args:
         capture: A video: frames are compared with those that follow.
@@ -106,16 +106,16 @@ def quality(
         raise OptionError("the capture has no depth", where=capture.name, do="take overlap flow")
     by_depth = capture.depth is not None and overlap != "flow"
 
-    def seen(i: int, j: int, one: Picture, other: Picture) -> Overlap:
+    def seen(i: int, j: int, one: Image, other: Image) -> Overlap:
         if by_depth:
             return depth_overlap(capture, int(chosen[i]), int(chosen[j]), one.shape[::-1])
         return flow_overlap(one, other)
 
-    pictures = (grey(capture.needed_frames, int(i)) for i in chosen)
+    images = (grey(capture.needed_frames, int(i)) for i in chosen)
     if way == "published":
-        scores = _published(pictures, seen)
+        scores = _published(images, seen)
     else:
-        scores = _reconciled(pictures, seen, anchor=ANCHORS["depth" if by_depth else "flow"])
+        scores = _reconciled(images, seen, anchor=ANCHORS["depth" if by_depth else "flow"])
     return Quality(chosen, scores, window_weights(scores))
 
 
@@ -152,37 +152,35 @@ def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.
     return weights
 
 
-def _published(pictures: Iterable[Picture], seen: Seen) -> Float64[np.ndarray, "m"]:
+def _published(images: Iterable[Image], seen: Seen) -> Float64[np.ndarray, "m"]:
     current, following, before = [], [], None
-    for j, picture in enumerate(pictures):
-        response = laplacian(picture)
+    for j, image in enumerate(images):
+        response = laplacian(image)
         if before is not None:
-            both = seen(j - 1, j, before[0], picture)
+            both = seen(j - 1, j, before[0], image)
             pair = compared(j - 1, j, {j - 1: before[1], j: response}, both)
             current.append(pair.first)
             following.append(pair.second)
-        before = picture, response
+        before = image, response
     own = 0.0 if before is None else float(before[1].astype(np.float64).var())
     return chained(np.array([*current, own]), np.array([*following, own]))
 
 
-def _reconciled(
-    pictures: Iterable[Picture], seen: Seen, *, anchor: float
-) -> Float64[np.ndarray, "m"]:
+def _reconciled(images: Iterable[Image], seen: Seen, *, anchor: float) -> Float64[np.ndarray, "m"]:
     own: tuple[list[float], list[float]] = ([], [])
     pairs: tuple[list[Comparison], list[Comparison]] = ([], [])
     # Only the last few of a long video are held at once.
-    last: deque[tuple[int, Picture, tuple[Response, Response]]] = deque(maxlen=NEIGHBOURS)
-    for j, picture in enumerate(pictures):
-        bent = bending(picture)
+    last: deque[tuple[int, Image, tuple[Response, Response]]] = deque(maxlen=NEIGHBOURS)
+    for j, image in enumerate(images):
+        bent = bending(image)
         for i, earlier, bent_earlier in last:
-            both = seen(i, j, earlier, picture)
+            both = seen(i, j, earlier, image)
             for way in (0, 1):
                 responses = {i: bent_earlier[way], j: bent[way]}
                 pairs[way].append(compared(i, j, responses, both))
         for way in (0, 1):
             own[way].append(float(bent[way].astype(np.float64).var()))
-        last.append((j, picture, bent))
+        last.append((j, image, bent))
     scores = [reconciled(np.array(own[way]), pairs[way], anchor=anchor) for way in (0, 1)]
     return np.sqrt(scores[0] * scores[1])
 
@@ -200,15 +198,15 @@ def grey(frames: Frames, frame: int) -> UInt8[np.ndarray, "h w"]:
     )
 
 
-def laplacian(picture: Picture) -> Response:
+def laplacian(image: Image) -> Response:
     """Laplacian (four neighbours) of the mean over 5x5 px, signed: the published response."""
-    smooth = cv2.blur(picture.astype(np.float32), (SMOOTHED_PUBLISHED, SMOOTHED_PUBLISHED))
+    smooth = cv2.blur(image.astype(np.float32), (SMOOTHED_PUBLISHED, SMOOTHED_PUBLISHED))
     return cv2.Laplacian(smooth, cv2.CV_32F, ksize=1)
 
 
-def bending(picture: Picture) -> tuple[Response, Response]:
+def bending(image: Image) -> tuple[Response, Response]:
     """Second derivatives of the mean over 3x3 px, across and down."""
-    smooth = cv2.blur(picture.astype(np.float32), (SMOOTHED, SMOOTHED))
+    smooth = cv2.blur(image.astype(np.float32), (SMOOTHED, SMOOTHED))
     return cv2.Sobel(smooth, cv2.CV_32F, 2, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 2)
 
 
@@ -249,9 +247,9 @@ def reconciled(
     """Scores that agree best with all comparisons, by least squares on their logarithms.
 
     Args:
-        own: Variance of each whole picture: a faint hint, without which the scale were free.
+        own: Variance of each whole image: a faint hint, without which the scale were free.
         comparisons: Of any pairs of frames.
-        anchor: How much that hint counts against a comparison of whole pictures.
+        anchor: How much that hint counts against a comparison of whole images.
     """
     system, right = np.diag(np.full(len(own), anchor)), anchor * np.log(own + TINY)
     for pair in comparisons:

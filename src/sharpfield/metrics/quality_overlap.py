@@ -1,4 +1,4 @@
-"""Which pixels of two pictures show the same: by measured depth and poses, or by optical flow."""
+"""Which pixels of two images show the same: by measured depth and poses, or by optical flow."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,12 @@ BORDER = 20 / 640
 SAME_DEPTH = 0.05
 """Depths that differ by less than this share are of one surface."""
 FLOW_SHRINK = 2
-"""Flow is found in pictures so many times smaller."""
+"""Flow is found in images so many times smaller."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Pixels of one picture, and where another shows the same."""
+    """Pixels of one image, and where another shows the same."""
 
     here: Int64[np.ndarray, "q 2"]
     """Rows and columns."""
@@ -37,7 +37,7 @@ def depth_overlap(capture: Capture, first: int, second: int, size: tuple[int, in
         capture: With depth.
         first: The frame whose pixels are looked up.
         second: The frame in which they are found.
-        size: Width and height of the pictures to compare, of the same field of view.
+        size: Width and height of the images to compare, of the same field of view.
     """
     camera, depth = capture.camera, capture.needed_depth
     here = _lattice(size)
@@ -59,7 +59,7 @@ def depth_overlap(capture: Capture, first: int, second: int, size: tuple[int, in
 
 
 def flow_overlap(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> Overlap:
-    """What two grey pictures both show, by dense optical flow (DIS).
+    """What two grey images both show, by dense optical flow (DIS).
 
     Source: Kroeger et al., "Fast optical flow using dense inverse search" (ECCV 2016).
     """
@@ -87,7 +87,7 @@ def _kept(
     good: np.ndarray,
     size: tuple[int, int],
 ) -> Overlap:
-    """Pairs away from the borders of both pictures."""
+    """Pairs away from the borders of both images."""
     border = round(BORDER * size[0])
     least, most = border, np.array(size)[::-1] - border
     for place in (here, there):

@@ -36,7 +36,7 @@ CHUNK = 1 << 14
 """Queries that the definition works on at once."""
 
 HELD = 1 << 16
-"""Cells whose surroundings are worked on at once: few enough to stay close to the processor."""
+"""Cells whose surroundings are worked on at once: few enough to stay close to the CPU."""
 
 
 @dataclass(frozen=True)

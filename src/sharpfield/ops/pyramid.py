@@ -1,8 +1,8 @@
-"""Reading pictures and their smaller maps of features at pixels.
+"""Reading images and their smaller maps of features at pixels.
 
-Vocabulary: the *levels* of some pictures are maps `[n, h, w, f]`, channels last, the first of the
-pictures' own size and the others of any other. A pixel of the picture is read from every level,
-bilinearly and clamped to it: equal to enlarging all maps to the size of the picture first, but the
+Vocabulary: the *levels* of some images are maps `[n, h, w, f]`, channels last, the first of the
+images' own size and the others of any other. A pixel of the image is read from every level,
+bilinearly and clamped to it: equal to enlarging all maps to the size of the image first, but the
 enlarged maps never exist.
 """
 
@@ -24,9 +24,9 @@ def look_up(
     """What all levels hold at pixels, side by side.
 
     Args:
-        xy: In pixels of the picture, centres at +0.5.
-        source: The picture of each.
-        levels: Of all pictures.
+        xy: In pixels of the image, centres at +0.5.
+        source: The image of each.
+        levels: Of all images.
     """
     height, width = levels[0].shape[1:3]
     return torch.cat([_bilinear(level, source, xy, (height, width)) for level in levels], -1)
@@ -47,7 +47,7 @@ def _bilinear(
     xy: Float[Tensor, "m 2"],
     size: tuple[int, int],
 ) -> Float[Tensor, "m f"]:
-    """One level at pixels of the picture, whose height and width are `size`."""
+    """One level at pixels of the image, whose height and width are `size`."""
     height, width = level.shape[1:3]
     rows = level.reshape(-1, level.shape[-1])
     place = xy * xy.new_tensor([width / size[1], height / size[0]]) - 0.5

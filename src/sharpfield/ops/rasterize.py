@@ -27,7 +27,7 @@ NEAR = 0.01
 WIDEN = 0.1
 """Added to the variance of every splat, in px^2, so that none falls between pixels. A pixel gathers
 light over a square, whose variance is 1/12 (Yu et al., "Mip-Splatting", CVPR 2024). The 0.3 of the
-first paper makes pictures softer than their pixels, which the scene then cannot make up for."""
+first paper makes images softer than their pixels, which the scene then cannot make up for."""
 
 FAINTEST = 1 / 255
 """Where a splat stops less of the light than this, it is not drawn."""

@@ -1,9 +1,9 @@
 """Deblur the frames of a capture with its events alone: the event double integral, frame by frame.
 
 No scene is learned. It is the quickest look at what the events of a capture know, and a check of
-thresholds, clocks and pixel grids: where these are wrong, the pictures get worse, not better.
+thresholds, clocks and pixel grids: where these are wrong, the images get worse, not better.
 
-What deblurring leaves behind: pictures, a sheet of before and after, numbers.
+What deblurring leaves behind: images, a sheet of before and after, numbers.
 """
 
 from dataclasses import dataclass
@@ -43,12 +43,12 @@ class DeblurOptions:
     made to agree with the events between them. `published`: as the released Ev-DeblurNeRF does it,
     on stored values with eight slices."""
     instants: int = 1
-    """Pictures per exposure, in the middles of as many equal parts of it. Only for `exact`."""
+    """Images per exposure, in the middles of as many equal parts of it. Only for `exact`."""
 
     def __post_init__(self) -> None:
         if self.instants < 1 or (self.instants > 1 and self.method != "exact"):
             raise OptionError(
-                "only the exact method gives several pictures per exposure",
+                "only the exact method gives several images per exposure",
                 got=f"{self.instants} with method {self.method}",
                 do="use method `exact`, or 1 instant",
             )
@@ -56,9 +56,9 @@ class DeblurOptions:
 
 @dataclass(frozen=True)
 class Deblurred:
-    """Sharp pictures of the frames of a capture, as the frames are stored."""
+    """Sharp images of the frames of a capture, as the frames are stored."""
 
-    pictures: Shaped[np.ndarray, "n k h w c"]
+    images: Shaped[np.ndarray, "n k h w c"]
     """One per instant of each exposure."""
     frame: Int64[np.ndarray, "n"]
     """Index of each one's frame in the capture."""
@@ -67,7 +67,7 @@ class Deblurred:
 
 
 def deblur(capture: Capture, options: DeblurOptions) -> Deblurred:
-    """Sharp pictures of the frames to learn from; of all blurred frames if none are named.
+    """Sharp images of the frames to learn from; of all blurred frames if none are named.
 
     Raises:
         CaptureError: Frames or events are missing, or no frame is blurred.
@@ -86,17 +86,17 @@ def deblur(capture: Capture, options: DeblurOptions) -> Deblurred:
     parts = (np.arange(options.instants) + 0.5) / options.instants
     instants = opens[:, None] + np.rint(length[:, None] * parts).astype(np.int64)
     if options.method == "joint":
-        pictures = _joint(capture, motion, chosen, instants[:, 0], found.thresholds)
+        images = _joint(capture, motion, chosen, instants[:, 0], found.thresholds)
     elif options.method == "published":
-        pictures = np.stack([_published(capture, int(i), found.thresholds) for i in chosen])
+        images = np.stack([_published(capture, int(i), found.thresholds) for i in chosen])
     else:
-        pictures = np.stack(
+        images = np.stack(
             [
                 _exact(capture, motion, int(i), when, found.thresholds)
                 for i, when in zip(chosen, instants, strict=True)
             ]
         )
-    return Deblurred(pictures, chosen, instants, found)
+    return Deblurred(images, chosen, instants, found)
 
 
 def _thresholds(capture: Capture, motion: EventMotion, options: DeblurOptions) -> Found:
@@ -156,31 +156,31 @@ def _joint(
     return _stored(capture, made)[:, None]
 
 
-def _stored(capture: Capture, picture: Float[Tensor, "*n h w c"]) -> Shaped[np.ndarray, "*n h w c"]:
+def _stored(capture: Capture, image: Float[Tensor, "*n h w c"]) -> Shaped[np.ndarray, "*n h w c"]:
     """Rounded to the frames' own type."""
     frames = capture.needed_frames
-    return np.rint(picture.clamp(0, 1).numpy() * frames.white).astype(frames.images.dtype)
+    return np.rint(image.clamp(0, 1).numpy() * frames.white).astype(frames.images.dtype)
 
 
 SHEET_ROWS, GAP = 4, 4
-"""The contact sheet: so many frames below each other, so many pixels between pictures."""
+"""The contact sheet: so many frames below each other, so many pixels between images."""
 
-Picture = Shaped[np.ndarray, "h w c"]
+Image = Shaped[np.ndarray, "h w c"]
 
 
 def deblur_to(capture: Capture, out: Path, options: DeblurOptions) -> Deblurred:
-    """Deblur; write the pictures, `contact.png` and `deblur.json` to a folder.
+    """Deblur; write the images, `contact.png` and `deblur.json` to a folder.
 
-    A frame's picture has its name; several of one exposure have `_0`, `_1`, ... appended.
+    A frame's image has its name; several of one exposure have `_0`, `_1`, ... appended.
 
     Raises:
         CaptureError: See `deblur`.
     """
     made = deblur(capture, options)
     out.mkdir(parents=True, exist_ok=True)
-    for names, pictures in zip(_names(capture, made), made.pictures, strict=True):
-        for name, picture in zip(names, pictures, strict=True):
-            write_image(out / name, picture)
+    for names, images in zip(_names(capture, made), made.images, strict=True):
+        for name, image in zip(names, images, strict=True):
+            write_image(out / name, image)
     write_image(out / "contact.png", contact_sheet(capture, made))
     write_json(out / "deblur.json", summary(capture, made))
     return made
@@ -189,20 +189,20 @@ def deblur_to(capture: Capture, out: Path, options: DeblurOptions) -> Deblurred:
 def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
     """Thresholds, times and scores, ready for JSON.
 
-    Scores are those of the picture nearest the middle of each exposure, and of the blurred frame
+    Scores are those of the image nearest the middle of each exposure, and of the blurred frame
     before: the density of edges (lower is sharper), the energy of the gradient (higher is sharper,
     or noisier), and PSNR where the truth is known.
     """
     rows = [
         {
             "frame": capture.needed_frames.names[frame],
-            "pictures": names,
+            "images": names,
             "times_us": instants.tolist(),
             "before": _scores(capture, int(frame), capture.needed_frames.images[frame]),
-            "after": _scores(capture, int(frame), _middle(pictures)),
+            "after": _scores(capture, int(frame), _middle(images)),
         }
-        for frame, names, instants, pictures in zip(
-            made.frame, _names(capture, made), made.instants_us, made.pictures, strict=True
+        for frame, names, instants, images in zip(
+            made.frame, _names(capture, made), made.instants_us, made.images, strict=True
         )
     ]
     used = made.found.thresholds
@@ -219,16 +219,16 @@ def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
 
 
 def contact_sheet(capture: Capture, made: Deblurred) -> UInt8[np.ndarray, "H W 3"]:
-    """Blurred, deblurred and, where known, true pictures side by side, a few frames of them."""
+    """Blurred, deblurred and, where known, true images side by side, a few frames of them."""
     held = capture.needed_frames
     rows = evenly_spread(np.arange(len(made.frame)), SHEET_ROWS)
     lines = []
     for row in rows:
         frame = int(made.frame[row])
-        line = [held.images[frame], _middle(made.pictures[row])]
+        line = [held.images[frame], _middle(made.images[row])]
         truth = _truth(capture, frame)
         lines.append(
-            [_eight_bit(picture, held.white) for picture in [*line, truth] if picture is not None]
+            [_eight_bit(image, held.white) for image in [*line, truth] if image is not None]
         )
     widest = max(len(line) for line in lines)
     height, width = lines[0][0].shape[:2]
@@ -236,23 +236,23 @@ def contact_sheet(capture: Capture, made: Deblurred) -> UInt8[np.ndarray, "H W 3
         (len(lines) * (height + GAP) - GAP, widest * (width + GAP) - GAP, 3), 255, np.uint8
     )
     for i, line in enumerate(lines):
-        for j, picture in enumerate(line):
+        for j, image in enumerate(line):
             top, left = i * (height + GAP), j * (width + GAP)
-            sheet[top : top + height, left : left + width] = picture
+            sheet[top : top + height, left : left + width] = image
     return sheet
 
 
 def _names(capture: Capture, made: Deblurred) -> list[list[str]]:
     stems = [Path(capture.needed_frames.names[frame]).stem for frame in made.frame]
-    count = made.pictures.shape[1]
+    count = made.images.shape[1]
     if count == 1:
         return [[f"{stem}.png"] for stem in stems]
     return [[f"{stem}_{k}.png" for k in range(count)] for stem in stems]
 
 
-def _scores(capture: Capture, frame: int, picture: Picture) -> dict[str, float]:
+def _scores(capture: Capture, frame: int, image: Image) -> dict[str, float]:
     white = capture.needed_frames.white
-    shown = torch.from_numpy(np.asarray(picture, np.float32)) / white
+    shown = torch.from_numpy(np.asarray(image, np.float32)) / white
     scores = {
         "edge_density": edge_density(luma(shown)[..., None]),
         "gradient_energy": float(gradient_energy(shown)),
@@ -272,15 +272,15 @@ def _mean(scores: list[dict[str, float]]) -> dict[str, float]:
     }
 
 
-def _truth(capture: Capture, frame: int) -> Picture | None:
+def _truth(capture: Capture, frame: int) -> Image | None:
     held = capture.needed_frames
     return held.truth[frame] if held.truth is not None and held.with_truth[frame] else None
 
 
-def _middle(pictures: Shaped[np.ndarray, "k h w c"]) -> Picture:
-    return pictures[len(pictures) // 2]
+def _middle(images: Shaped[np.ndarray, "k h w c"]) -> Image:
+    return images[len(images) // 2]
 
 
-def _eight_bit(picture: Picture, white: int) -> UInt8[np.ndarray, "h w 3"]:
-    scaled = np.rint(np.asarray(picture, np.float64) * (255 / white)).astype(np.uint8)
+def _eight_bit(image: Image, white: int) -> UInt8[np.ndarray, "h w 3"]:
+    scaled = np.rint(np.asarray(image, np.float64) * (255 / white)).astype(np.uint8)
     return np.broadcast_to(scaled, (*scaled.shape[:2], 3))

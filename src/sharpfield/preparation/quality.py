@@ -1,6 +1,6 @@
-"""Which frames of a video are sharp: scores, weights, and a picture of the ranking.
+"""Which frames of a video are sharp: scores, weights, and a image of the ranking.
 
-Blur a folder of sharp pictures, each by one random motion kernel, and say what was done.
+Blur a folder of sharp images, each by one random motion kernel, and say what was done.
 """
 
 import json
@@ -22,7 +22,7 @@ from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, 
 from sharpfield.storage.images import list_images, read_image, write_image
 
 SHOWN = 5
-"""Frames at each end of the ranking that the picture shows."""
+"""Frames at each end of the ranking that the image shows."""
 BLUR_NOTE = "blur_px"
 """Note of a simulated capture: the true blur of each frame."""
 
@@ -31,10 +31,10 @@ BLUR_NOTE = "blur_px"
 class QualityOptions:
     """How frames are judged."""
 
-    source: Literal["auto", "pictures", "events"] = "auto"
+    source: Literal["auto", "images", "events"] = "auto"
     """What tells: auto takes events where the capture has them."""
     overlap: Means = "auto"
-    """What two pictures both show: by depth (auto, where there is some) or optical flow."""
+    """What two images both show: by depth (auto, where there is some) or optical flow."""
     way: Way = "reconciled"
     """Compare with several neighbours; or as published, with the next only."""
     every_frame: bool = False
@@ -152,32 +152,32 @@ def _ranks(values: Float64[np.ndarray, "m"]) -> Float64[np.ndarray, "m"]:
 ABOUT = "blur.json"
 
 
-def blur_pictures(
+def blur_images(
     folder: Path, out: Path, *, ranges: KernelRange = PUBLISHED, seed: int = 0
 ) -> list[dict[str, Any]]:
     """Write blurred copies of the same names and sizes, and `blur.json`; all of it or nothing.
 
-    Pictures that stay sharp are copied byte for byte. What is drawn for a picture depends on the
+    Images that stay sharp are copied byte for byte. What is drawn for a image depends on the
     seed and its place in the order of names.
 
     Args:
-        folder: PNG or JPEG pictures.
+        folder: PNG or JPEG images.
         out: A new or empty folder, or an earlier result.
         ranges: What kernels are drawn from.
         seed: Another seed, other kernels.
 
     Returns:
-        A row for each picture: its name, whether it was blurred, k, phi, and how far it reaches.
+        A row for each image: its name, whether it was blurred, k, phi, and how far it reaches.
 
     Raises:
-        CaptureError: There are no pictures, one cannot be read, or `out` holds something else.
+        CaptureError: There are no images, one cannot be read, or `out` holds something else.
     """
     paths = list_images(folder)
     if not paths:
-        raise CaptureError("there are no pictures", where=folder, do="give PNG or JPEG files")
+        raise CaptureError("there are no images", where=folder, do="give PNG or JPEG files")
     if out.exists() and not (out.is_dir() and (is_result(out) or not any(out.iterdir()))):
         raise CaptureError(
-            "will not replace what is not a folder of blurred pictures",
+            "will not replace what is not a folder of blurred images",
             where=out,
             do="choose another place, or empty it",
         )
@@ -197,12 +197,12 @@ def blur_pictures(
             "k": list(ranges.k),
             "phi": list(ranges.phi),
             "probability": ranges.probability,
-            "pictures": rows,
+            "images": rows,
         }
         (fresh / ABOUT).write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
     return rows
 
 
 def is_result(folder: Path) -> bool:
-    """Whether a folder was written by `blur_pictures`."""
+    """Whether a folder was written by `blur_images`."""
     return (folder / ABOUT).is_file()

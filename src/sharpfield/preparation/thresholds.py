@@ -54,7 +54,7 @@ def find_thresholds(capture: Capture, motion: EventMotion) -> Found:
     """Thresholds that explain the blurred frames best.
 
     Neighbouring frames of one track decide by disagreement, for each sign by itself; a capture of
-    a single blurred frame leaves only the density of edges in the deblurred picture.
+    a single blurred frame leaves only the density of edges in the deblurred image.
 
     Raises:
         CaptureError: There are no frames, or no events.

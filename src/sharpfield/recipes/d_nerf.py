@@ -1,7 +1,7 @@
 """D-NeRF: a moving scene from frames. What events must beat where frames are blurred or few.
 
 A. Pumarola et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021. Frames may come
-from anywhere: a camera, another model's renders, or a network that makes pictures of events; see
+from anywhere: a camera, another model's renders, or a network that makes images of events; see
 `sharpfield ingest` and the layout `d-nerf`.
 """
 
@@ -120,7 +120,7 @@ class Model(nn.Module):
         """Linear light."""
         return self.scene.view(rays)
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 

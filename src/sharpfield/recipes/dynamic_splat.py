@@ -12,8 +12,8 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
 from sharpfield.recipes.splats.dynamic_model import DynamicModel
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions
-from sharpfield.recipes.splats.learned_calibration import UnknownOptions
-from sharpfield.sampling.rig_views import RigLookOptions
+from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
+from sharpfield.sampling.rig_views import RigSamplingOptions
 
 R = TypeVar("R", bound="DynamicSplat")
 
@@ -56,8 +56,10 @@ class DynamicSplat:
     steps: int = 10_000
     """Length of the schedule."""
     gaussians: DynamicOptions = field(default_factory=DynamicOptions)
-    looks: RigLookOptions = field(default_factory=lambda: RigLookOptions(sharp=0.0, windows=0.0))
-    unknowns: UnknownOptions = field(default_factory=UnknownOptions)
+    looks: RigSamplingOptions = field(
+        default_factory=lambda: RigSamplingOptions(sharp=0.0, windows=0.0)
+    )
+    unknowns: LearnedCalibrationOptions = field(default_factory=LearnedCalibrationOptions)
 
     def lasting(self: R, steps: int) -> R:
         """The same recipe with its whole schedule stretched or shrunk; it is given in parts."""
@@ -75,7 +77,7 @@ class EvDynamicSplat(DynamicSplat):
 
     paper: ClassVar[Paper] = OURS
 
-    looks: RigLookOptions = field(default_factory=RigLookOptions)
+    looks: RigSamplingOptions = field(default_factory=RigSamplingOptions)
 
     def build(self, capture: Capture, seed: int) -> DynamicModel:
         """On events and whatever frames there are."""

@@ -207,7 +207,7 @@ class Model(nn.Module):
         """Light, up to a power and a factor."""
         return self.scene.view(rays)
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As it is: events do not tell how frames would store it."""
         return light.clamp(0, 1)
 

@@ -1,4 +1,4 @@
-"""Hybrid neural rendering: rooms from blurry video, by neural points and the pictures around.
+"""Hybrid neural rendering: rooms from blurry video, by neural points and the images around.
 
 P. Dai et al., *Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur*, CVPR 2023. Points
 say what is where, the frames nearby what it looks like. Rendered patches are blurred like recorded
@@ -25,7 +25,7 @@ from sharpfield.formation.patch_kernel import (
 from sharpfield.metrics.frame_weights import Judge, frame_weights
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.points.hybrid_checkpoint import load_released
-from sharpfield.recipes.points.images import PictureBranch, SourceOptions
+from sharpfield.recipes.points.images import ImageBranch, SourceOptions
 from sharpfield.recipes.points.model import DrawOptions, PointModel
 from sharpfield.recipes.points.scene import PointScene
 
@@ -52,10 +52,10 @@ PAPER = Paper(
         " the momentum of Adam. Nothing restarts when points grow.",
         "Maps of features are read at their own size, which gives the same numbers as enlarging"
         " them first.",
-        "Pictures do not tell about places behind their camera or a little outside their edge.",
+        "Images do not tell about places behind their camera or a little outside their edge.",
         "Rays that miss are left out of a patch before it is blurred; the released code blurs the"
         " background into their neighbours.",
-        "Which patches do without pictures is drawn anew each step; the released code always takes"
+        "Which patches do without images is drawn anew each step; the released code always takes"
         " the same slots, whose places in the image are by chance.",
         "New points in one round of growth all get the same share of their neighbours' confidence;"
         " in the released code those of earlier frames get powers of it.",
@@ -89,7 +89,7 @@ class BlurOptions:
 
 @dataclass(frozen=True)
 class Hybrid(PointNeRF):
-    """Neural points and features of nearby pictures to a scene, from blurry video with depth."""
+    """Neural points and features of nearby images to a scene, from blurry video with depth."""
 
     paper: ClassVar[Paper] = PAPER
 
@@ -100,7 +100,7 @@ class Hybrid(PointNeRF):
     """How much each frame counts: all alike; as published; by events where there are any; by how
     sharp frames look; by events."""
     merge: int = 64
-    """Width of the network that weighs pictures."""
+    """Width of the network that weighs images."""
     released: str = ""
     """A checkpoint of the released code to start from: its `*_net_ray_marching.pth`."""
 
@@ -118,9 +118,9 @@ class Hybrid(PointNeRF):
             )
         weight = quality_of(capture, self.quality)
         scene = PointScene(self.cloud, self.sizes, self.march, capture, seed, weight=weight)
-        pictures = None
+        images = None
         if self.sources.count > 0:
-            pictures = PictureBranch(
+            images = ImageBranch(
                 self.sources,
                 capture,
                 self.sizes.feature,
@@ -134,13 +134,13 @@ class Hybrid(PointNeRF):
             capture,
             seed,
             scene,
-            pictures=pictures,
+            images=images,
             blur=self._blur(seed),
             light=self.blur.light,
             weight=weight,
         )
         if self.released:
-            load_released(Path(self.released), scene.field, model.head, pictures, model.blur)
+            load_released(Path(self.released), scene.field, model.head, images, model.blur)
         return model
 
     def _blur(self, seed: int) -> ChosenKernel | LearnedKernel | None:

@@ -30,37 +30,37 @@ def real(recipe: EvDNeRF) -> EvDNeRF:
 
 
 def evdnerf_draft(recipe: EvDNeRF) -> EvDNeRF:
-    """Smaller networks, fewer pixels, a higher rate; minutes on two processor cores."""
+    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
     scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
     return replace(recipe.lasting(2000), rate=10 * recipe.rate, pairs=128, scene=scene)
 
 
 def evdnerf_standard(recipe: EvDNeRF) -> EvDNeRF:
-    """Half as wide and a tenth as long; for a graphics card."""
+    """Half as wide and a tenth as long; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
     return replace(recipe.lasting(20_000), rate=5 * recipe.rate, scene=scene)
 
 
 def d_nerf_draft(recipe: DNeRF) -> DNeRF:
-    """Smaller networks, fewer pixels, a higher rate; minutes on two processor cores."""
+    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
     scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
     return replace(recipe.lasting(2000), rate=2e-3, pixels=256, scene=scene)
 
 
 def d_nerf_standard(recipe: DNeRF) -> DNeRF:
-    """Half as wide; for a graphics card."""
+    """Half as wide; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
     return replace(recipe.lasting(40_000), rate=1e-3, pixels=1024, scene=scene)
 
 
 def physical_draft(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
-    """Minutes on two processor cores."""
+    """Minutes on two CPU cores."""
     windows = replace(recipe.windows, spans=64, counted=320)
     return replace(recipe.lasting(2000), windows=windows)
 
 
 def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
-    """Finer in space and time; an hour on a processor."""
+    """Finer in space and time; an hour on a CPU."""
     size = SpaceTimeSize(still=96, moving=80, moments=48)
     scene = replace(recipe.scene, size=size, steps=96)
     windows = replace(recipe.windows, spans=256, counted=1280)
@@ -68,12 +68,12 @@ def physical_standard(recipe: EvDNeRFPhysical) -> EvDNeRFPhysical:
 
 
 def dynamic_draft(recipe: DynamicSplat) -> DynamicSplat:
-    """Minutes on two processor cores."""
+    """Minutes on two CPU cores."""
     return recipe.lasting(8000)
 
 
 def dynamic_standard(recipe: DynamicSplat) -> DynamicSplat:
-    """More Gaussians, and more cameras and instants in each step; an hour on a processor."""
+    """More Gaussians, and more cameras and instants in each step; an hour on a CPU."""
     return replace(
         recipe.lasting(20_000),
         gaussians=replace(recipe.gaussians, density=1.5, density_moving=4.5),

@@ -107,7 +107,7 @@ class Model(nn.Module):
         """Linear light."""
         return self.volume.view(rays)
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 

@@ -58,7 +58,7 @@ class PointNeRF:
     decisive: float = 1e-4
     """Weight of the term that makes confidences 0 or 1."""
     start_colours: bool = False
-    """The network adds to colours that points and pictures have, instead of making its own."""
+    """The network adds to colours that points and images have, instead of making its own."""
     drawn: DrawOptions = field(default_factory=DrawOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     sizes: PointSizes = field(default_factory=PointSizes)

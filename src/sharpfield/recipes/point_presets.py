@@ -31,19 +31,19 @@ def learned(recipe: Hybrid) -> Hybrid:
     return replace(recipe, blur=replace(recipe.blur, kind="learned"))
 
 
-def no_pictures(recipe: Hybrid) -> Hybrid:
+def no_images(recipe: Hybrid) -> Hybrid:
     """The control of the paper: points alone."""
     return replace(recipe, sources=replace(recipe.sources, count=0))
 
 
 def point_draft(recipe: P) -> P:
-    """Minutes on two processor cores: small networks on averaged neighbours, and first colours."""
+    """Minutes on two CPU cores: small networks on averaged neighbours, and first colours."""
     recipe = _quick(recipe, points=50_000, width=64, feature=64, pixels=1024, asked=12)
     return replace(recipe.lasting(2000), rate=2e-3, points_rate=5e-3, decay=0.05)
 
 
 def point_standard(recipe: P) -> P:
-    """Minutes on a graphics card, hours on a processor."""
+    """Minutes on a GPU, hours on a CPU."""
     recipe = _quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, asked=16)
     return replace(recipe.lasting(20_000), rate=1e-3, points_rate=4e-3, decay=0.05)
 
@@ -54,12 +54,12 @@ def point_paper(recipe: P) -> P:
 
 
 def hybrid_draft(recipe: Hybrid) -> Hybrid:
-    """Minutes on two processor cores; sources by pose, what hides them by depth, light adds up."""
+    """Minutes on two CPU cores; sources by pose, what hides them by depth, light adds up."""
     return replace(_knowing(point_draft(recipe)), merge=32)
 
 
 def hybrid_standard(recipe: Hybrid) -> Hybrid:
-    """Minutes on a graphics card, hours on a processor."""
+    """Minutes on a GPU, hours on a CPU."""
     return _knowing(point_standard(recipe))
 
 
@@ -95,7 +95,7 @@ def _quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, ask
 
 
 def _knowing(recipe: Hybrid) -> Hybrid:
-    """Pictures chosen and seen through by what poses and depth tell."""
+    """Images chosen and seen through by what poses and depth tell."""
     sources = replace(
         recipe.sources,
         choose="pose",
@@ -116,5 +116,5 @@ HYBRID_VARIANTS = {
     "h-only": h_only,
     "rooms": rooms,
     "learned": learned,
-    "no-pictures": no_pictures,
+    "no-images": no_images,
 }

@@ -91,7 +91,7 @@ STANDARD: dict[str, Any] = {
 
 
 def draft(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
-    """Minutes on two processor cores: a dense grid instead of planes and networks."""
+    """Minutes on two CPU cores: a dense grid instead of planes and networks."""
     recipe = recipe.lasting(2000)
     frames = recipe.frames
     frames = replace(
@@ -116,7 +116,7 @@ def draft(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
 
 
 def standard(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
-    """Minutes on a graphics card, hours on a processor."""
+    """Minutes on a GPU, hours on a CPU."""
     return replace(recipe.lasting(10_000), volume=replace(recipe.volume, **STANDARD))
 
 
@@ -137,12 +137,12 @@ def paper(recipe: EvDeblurNeRF) -> EvDeblurNeRF:
 
 
 def nerf_draft(recipe: NeRF) -> NeRF:
-    """A dense grid instead of large networks; minutes on two processor cores."""
+    """A dense grid instead of large networks; minutes on two CPU cores."""
     return NeRF(steps=2000, rate=GRID_RATE, decay=1000, pixels=1024, volume=VolumeOptions(**DRAFT))
 
 
 def nerf_standard(recipe: NeRF) -> NeRF:
-    """Planes; minutes on a graphics card."""
+    """Planes; minutes on a GPU."""
     volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **STANDARD)
     return NeRF(steps=10_000, rate=5e-3, decay=3333, smooth=0.02, volume=volume)
 
@@ -157,18 +157,18 @@ def refine(recipe: Splat) -> Splat:
     unknowns = replace(recipe.unknowns, thresholds="signs", knots=REFINED_KNOTS, offset=True)
     looks = recipe.looks
     if looks.sharp > 0:
-        # Sharp pictures are made with the thresholds that are believed, and would confirm them.
+        # Sharp images are made with the thresholds that are believed, and would confirm them.
         looks = replace(looks, early=0.3, sharp=0.01, windows=0.01, longest_us=200_000)
     return replace(recipe, looks=looks, unknowns=unknowns)
 
 
 def splat_draft(recipe: Splat) -> Splat:
-    """Minutes on two processor cores."""
+    """Minutes on two CPU cores."""
     return recipe.lasting(6000)
 
 
 def splat_standard(recipe: Splat) -> Splat:
-    """Minutes on a graphics card: more Gaussians, which shine, and more views of each exposure."""
+    """Minutes on a GPU: more Gaussians, which shine, and more views of each exposure."""
     return replace(
         recipe.lasting(15_000),
         gaussians=replace(recipe.gaussians, degree=3, density=1.5),
@@ -219,7 +219,7 @@ def names(recipe: str) -> dict[str, str]:
 def prepared(recipe: str, start: Any, preset: str, *, capture: Capture, device: str) -> Any:
     """A recipe with presets applied; what `preset` leaves open follows capture and machine.
 
-    Without a size, a processor gets `draft` and a graphics card `standard`. Without a variant, the
+    Without a size, a CPU gets `draft` and a GPU `standard`. Without a variant, the
     size `paper` gets the published recipe for this kind of sensor and the others `physical`.
 
     Args:

@@ -22,12 +22,12 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
-from sharpfield.initialisation.posed_images import sharp_light
+from sharpfield.initialisation.posed_images import sharp_light_images
 from sharpfield.recipes.hybrid import PAPER
-from sharpfield.recipes.splats.learned_calibration import UnknownOptions
-from sharpfield.recipes.splats.model import SplatModel, with_row_clock
+from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
+from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
 from sharpfield.recipes.splats.scene import GaussianOptions
-from sharpfield.sampling.views import LookOptions
+from sharpfield.sampling.views import SamplingOptions
 
 R = TypeVar("R", bound="Splat")
 
@@ -120,10 +120,10 @@ class Splat:
     steps: int = 15_000
     """Length of the schedule."""
     gaussians: GaussianOptions = field(default_factory=GaussianOptions)
-    looks: LookOptions = field(
-        default_factory=lambda: LookOptions(blur="none", sharp=0.0, windows=0.0)
+    looks: SamplingOptions = field(
+        default_factory=lambda: SamplingOptions(blur="none", sharp=0.0, windows=0.0)
     )
-    unknowns: UnknownOptions = field(default_factory=UnknownOptions)
+    unknowns: LearnedCalibrationOptions = field(default_factory=LearnedCalibrationOptions)
 
     def lasting(self: R, steps: int) -> R:
         """The same recipe with its whole schedule stretched or shrunk; it is given in parts."""
@@ -151,10 +151,12 @@ class BlurSplat(Splat):
 
     paper: ClassVar[Paper] = ZHAO
 
-    looks: LookOptions = field(
-        default_factory=lambda: LookOptions(instants=5, sharp=0.0, windows=0.0)
+    looks: SamplingOptions = field(
+        default_factory=lambda: SamplingOptions(instants=5, sharp=0.0, windows=0.0)
     )
-    unknowns: UnknownOptions = field(default_factory=lambda: UnknownOptions(knots=16))
+    unknowns: LearnedCalibrationOptions = field(
+        default_factory=lambda: LearnedCalibrationOptions(knots=16)
+    )
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ class EventSplat(Splat):
 
     paper: ClassVar[Paper] = XIONG
 
-    looks: LookOptions = field(default_factory=lambda: LookOptions(sharp=0.0, windows=0.04))
+    looks: SamplingOptions = field(default_factory=lambda: SamplingOptions(sharp=0.0, windows=0.04))
 
     def build(self, capture: Capture, seed: int) -> SplatModel:
         """On the events alone, whatever else there is."""
@@ -173,14 +175,14 @@ class EventSplat(Splat):
 
 @dataclass(frozen=True)
 class EvSplat(Splat):
-    """Gaussians from blurry frames and events together: first sharp pictures, then both as is."""
+    """Gaussians from blurry frames and events together: first sharp images, then both as is."""
 
     paper: ClassVar[Paper] = OURS
 
-    looks: LookOptions = field(default_factory=LookOptions)
+    looks: SamplingOptions = field(default_factory=SamplingOptions)
 
 
-def deblurred(capture: Capture, unknowns: UnknownOptions) -> Capture:
+def deblurred(capture: Capture, unknowns: LearnedCalibrationOptions) -> Capture:
     """The capture with its blurry training frames replaced by sharp ones from events.
 
     Raises:
@@ -192,7 +194,9 @@ def deblurred(capture: Capture, unknowns: UnknownOptions) -> Capture:
     images, train = np.array(frames.images), capture.split.train
     tone = tone_of(frames.encoding)
     for i, light in zip(
-        train, sharp_light(with_row_clock(capture), thresholds, train), strict=True
+        train,
+        sharp_light_images(align_events_to_rolling_shutter(capture), thresholds, train),
+        strict=True,
     ):
         images[i] = np.rint(tone.encode(light).numpy() * frames.white)
     middle = frames.exposure.middle_us
@@ -219,6 +223,6 @@ class RoomSplat(Splat):
     paper: ClassVar[Paper] = DAI
 
     gaussians: GaussianOptions = field(default_factory=lambda: GaussianOptions(density=1.5))
-    looks: LookOptions = field(
-        default_factory=lambda: LookOptions(still=0.5, quality="auto", depth=0.1)
+    looks: SamplingOptions = field(
+        default_factory=lambda: SamplingOptions(still=0.5, quality="auto", depth=0.1)
     )

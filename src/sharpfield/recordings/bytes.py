@@ -11,7 +11,7 @@ from typing import Any
 from sharpfield.core.errors import CaptureError, need
 
 BLOCK = 2**21
-"""Bytes read at once; small enough to stay in the processor's cache until they are decoded."""
+"""Bytes read at once; small enough to stay in the CPU's cache until they are decoded."""
 
 
 def head(path: Path, count: int) -> bytes:

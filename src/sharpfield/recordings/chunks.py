@@ -1,7 +1,7 @@
 """Pieces of events, as files happen to have them, joined to chunks that are sound.
 
 A file comes in packets, messages or blocks, of a few events or of millions. A reader turns each
-into a `Piece` and leaves the rest to `joined`, which drops and counts what cannot be (events
+into a `RawChunk` and leaves the rest to `joined`, which drops and counts what cannot be (events
 outside the sensor, or earlier than those before them) and hands on large chunks.
 
 Events that come a little late, put where they belong.
@@ -22,7 +22,7 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.recordings.recording import Chunks, Trouble
+from sharpfield.recordings.recording import Chunks, ReadLog
 
 CHUNK = 2**20
 """Most events in a chunk; all but the last one have at least half as many."""
@@ -37,7 +37,7 @@ that the size is that of another sensor, or that the columns are others."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class RawChunk:
     """Consecutive events, not looked at yet."""
 
     x: UInt16[np.ndarray, "n"]
@@ -52,11 +52,11 @@ class Piece:
 
     def __getitem__(self, part: slice | np.ndarray) -> "Piece":
         """A slice as views, or a choice as copies."""
-        return Piece(self.x[part], self.y[part], self.t_us[part], self.p[part])
+        return RawChunk(self.x[part], self.y[part], self.t_us[part], self.p[part])
 
 
 def joined(
-    pieces: Iterator[Piece], size: tuple[int, int], *, where: object, trouble: Trouble
+    pieces: Iterator[RawChunk], size: tuple[int, int], *, where: object, trouble: ReadLog
 ) -> Chunks:
     """Sound chunks of half to a whole `CHUNK` of events, made of pieces of any size.
 
@@ -71,7 +71,7 @@ def joined(
             sensor.
     """
     gate = _Gate(size, where, trouble)
-    waiting: list[Piece] = []
+    waiting: list[RawChunk] = []
     count = 0
     for piece in pieces:
         sound = gate.passed(piece)
@@ -145,12 +145,12 @@ def expect_inside(
 class _Gate:
     """Lets through what lies on the sensor and does not go back in time."""
 
-    def __init__(self, size: tuple[int, int], where: object, trouble: Trouble) -> None:
+    def __init__(self, size: tuple[int, int], where: object, trouble: ReadLog) -> None:
         self._size, self._where, self._trouble = size, where, trouble
         self._last_us = np.iinfo(np.int64).min
         self._seen = self._back = self._outside = 0
 
-    def passed(self, piece: Piece) -> Piece:
+    def passed(self, piece: RawChunk) -> RawChunk:
         """The sound events of the next piece."""
         if not _faultless(piece.x, piece.y, piece.t_us, *self._size, self._last_us):
             outside, back = _faults(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
@@ -162,7 +162,7 @@ class _Gate:
             self._last_us = int(piece.t_us[-1])
         return piece
 
-    def _note(self, piece: Piece, outside: int, back: int, keep: np.ndarray) -> None:
+    def _note(self, piece: RawChunk, outside: int, back: int, keep: np.ndarray) -> None:
         self._trouble.note("events outside the sensor", outside)
         self._trouble.note("events earlier than those before them", back)
         self._back += back
@@ -184,10 +184,10 @@ class _Gate:
             )
 
 
-def _together(pieces: list[Piece]) -> Piece:
+def _together(pieces: list[RawChunk]) -> RawChunk:
     if len(pieces) == 1:
         return pieces[0]
-    return Piece(
+    return RawChunk(
         x=np.concatenate([piece.x for piece in pieces]),
         y=np.concatenate([piece.y for piece in pieces]),
         t_us=np.concatenate([piece.t_us for piece in pieces]),
@@ -195,7 +195,7 @@ def _together(pieces: list[Piece]) -> Piece:
     )
 
 
-def _stream(piece: Piece, size: tuple[int, int]) -> EventStream:
+def _stream(piece: RawChunk, size: tuple[int, int]) -> EventStream:
     return EventStream(piece.x, piece.y, piece.t_us, piece.p, width=size[0], height=size[1])
 
 
@@ -258,7 +258,7 @@ class Reorder:
         self.end = 0
         """How many events are there."""
 
-    def taken(self, *, last: bool) -> Piece:
+    def taken(self, *, last: bool) -> RawChunk:
         """The events so far, but for those that may have to wait for late ones.
 
         Args:
@@ -275,7 +275,7 @@ class Reorder:
         self.columns, self.end = _columns(), len(t) - cut
         for column, rest in zip(self.columns, held, strict=True):
             column[: self.end] = rest
-        return Piece(x[:cut], y[:cut], t[:cut], p[:cut])
+        return RawChunk(x[:cut], y[:cut], t[:cut], p[:cut])
 
 
 def _columns() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

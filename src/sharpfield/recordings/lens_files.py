@@ -124,11 +124,11 @@ def ideal_pixels(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
 def seen_from(
     ideal: Camera, real: Camera, turn: Float64[np.ndarray, "3 3"] | None = None
 ) -> Float32[np.ndarray, "h w 2"]:
-    """Where each pixel of an ideal camera lies in the picture of a real one, for `cv2.remap`.
+    """Where each pixel of an ideal camera lies in the image of a real one, for `cv2.remap`.
 
     Args:
-        ideal: The camera whose picture is wanted.
-        real: The camera that took the picture.
+        ideal: The camera whose image is wanted.
+        real: The camera that took the image.
         turn: Takes directions from the ideal camera's axes to the real one's; where the two do not
             stand in the same place this holds for far points only.
     """

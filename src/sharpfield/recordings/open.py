@@ -48,11 +48,11 @@ class Format:
     suffixes: tuple[str, ...] = ()
     """Of files whose content says nothing."""
     takes: tuple[str, ...] = ("size",)
-    """What it can be told besides, see `Told`."""
+    """What it can be told besides, see `ReaderOptions`."""
 
 
 @dataclass(frozen=True)
-class Told:
+class ReaderOptions:
     """What the owner of a recording knows and its file does not say; None leaves it to the file."""
 
     unit: str | None = None
@@ -70,18 +70,18 @@ class Told:
     per_second: float | None = None
     """How many frames were taken per second."""
     times: Path | None = None
-    """The text that says when pictures were taken."""
+    """The text that says when images were taken."""
 
     def given(self) -> dict[str, Any]:
         """What was not left to the file."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
-NOTHING = Told()
+NOTHING = ReaderOptions()
 
 
 def open_recording(
-    path: Path | str, told: Told = NOTHING, *, layout: str | None = None
+    path: Path | str, told: ReaderOptions = NOTHING, *, layout: str | None = None
 ) -> Recording:
     """Open what a camera, or a program in its place, has written.
 
@@ -121,7 +121,7 @@ def open_events(
     Raises:
         CaptureError: See `open_recording`; or it holds no events.
     """
-    opened = open_recording(path, Told(unit=unit, size=sensor))
+    opened = open_recording(path, ReaderOptions(unit=unit, size=sensor))
     if opened.events is None:
         raise CaptureError("the recording holds no events", where=path, got=opened.layout)
     return opened
@@ -196,7 +196,7 @@ def _is_video(path: Path, head: bytes) -> bool:
     return riff or head[4:8] == b"ftyp" or head.startswith(b"\x1aE\xdf\xa3")
 
 
-def _has_pictures(path: Path, head: bytes) -> bool:
+def _has_images(path: Path, head: bytes) -> bool:
     if not path.is_dir() or any(
         (path / name).is_file() for name in ("events.txt", "metadata.yaml")
     ):
@@ -211,12 +211,12 @@ def _open_rpg(
     unit: str | None = None,
     columns: str | None = None,
 ) -> Recording:
-    """A folder of RPG's data set: `events.txt`, and `images.txt` with the pictures it names."""
+    """A folder of RPG's data set: `events.txt`, and `images.txt` with the images it names."""
     events = open_text(path / "events.txt", size=size, unit=unit, columns=columns)
     if not (path / "images.txt").is_file():
         return replace(events, path=path)
-    pictures = open_images(path)
-    return replace(events, path=path, frames=pictures.frames)
+    images = open_images(path)
+    return replace(events, path=path, frames=images.frames)
 
 
 FORMATS: dict[str, Format] = {
@@ -308,8 +308,8 @@ FORMATS: dict[str, Format] = {
         (".mp4", ".avi", ".mov", ".mkv", ".webm"),
         takes=("per_second",),
     ),
-    "pictures": Format(
-        _has_pictures,
+    "images": Format(
+        _has_images,
         open_images,
         "frames",
         "a folder of PNG or JPEG",

@@ -6,7 +6,7 @@ and everything is read in pieces, so a recording may be larger than memory. Time
 microseconds of the camera's own clock, as an int64; whatever wraps in the file is unwrapped.
 
 Reading goes on as far as the data are sound. What had to be left out (a torn end, events outside
-the sensor) is said once, as a `Trouble`; a file that is no recording at all is a `CaptureError`.
+the sensor) is said once, as a `ReadLog`; a file that is no recording at all is a `CaptureError`.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ Chunks = Iterator[EventStream]
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture of a camera, as its file has it."""
+    """One image of a camera, as its file has it."""
 
     image: Shaped[np.ndarray, "h w *c"]
     """uint8 or uint16; grey [h w] (of a colour sensor: raw, see `Recording.bayer`) or RGB."""
@@ -48,7 +48,7 @@ class Triggers:
 
 
 @dataclass
-class Trouble:
+class ReadLog:
     """What was left out while reading, counted by kind.
 
     Events, frames and triggers are read each by itself, and as often as one likes. A reading begins
@@ -63,7 +63,7 @@ class Trouble:
 
     def anew(self, reading: str) -> "Trouble":
         """What takes the notes of a reading that begins: "events", "frames", "triggers"."""
-        self.readings[reading] = Trouble()
+        self.readings[reading] = ReadLog()
         return self.readings[reading]
 
     def note(self, kind: str, count: int = 1) -> None:
@@ -102,7 +102,7 @@ class Recording:
     """Reads the trigger edges; None if the format has none."""
     bayer: str = ""
     """Colour filter tile of the raw sensor, e.g. "RGGB"; "" if mono or not known."""
-    trouble: Trouble = field(default_factory=Trouble)
+    trouble: ReadLog = field(default_factory=ReadLog)
     """What reading has left out so far; reading again tells the same, and not twice as much."""
     notes: dict[str, str] = field(default_factory=dict)
     """What the header says besides: camera, serial number, date, as the file spells it."""

@@ -1,4 +1,4 @@
-"""Frames alone: a video file, or a folder of pictures with a text that says when they were taken.
+"""Frames alone: a video file, or a folder of images with a text that says when they were taken.
 
 A video tells when each frame is to be shown, which is when it was taken unless it is slow motion:
 then the caller says how many were taken per second. For a folder, times come from one of
@@ -8,7 +8,7 @@ then the caller says how many were taken per second. For a folder, times come fr
     *timestamp*.txt, *times*.txt     a time a line
     timestamps.npz                   Ev-DeblurNeRF: `timestamps_start`, `timestamps_end`
 
-beside the pictures or in the folder above. Only RPG's text implies a unit; the caller names that
+beside the images or in the folder above. Only RPG's text implies a unit; the caller names that
 of the others, unless their header does.
 
 Source: Mueggler et al., *The Event-Camera Dataset and Simulator* (IJRR 2017), for `images.txt`;
@@ -25,7 +25,7 @@ from av.error import FFmpegError
 from jaxtyping import Int64, Shaped
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.recording import Frame, Recording, Trouble
+from sharpfield.recordings.recording import Frame, ReadLog, Recording
 from sharpfield.storage.arrays import load_arrays
 from sharpfield.storage.event_columns import UNITS, known_unit, whole_us
 from sharpfield.storage.images import list_images, read_image
@@ -51,8 +51,8 @@ def open_video(path: Path, *, per_second: float | None = None) -> Recording:
         CaptureError: It cannot be decoded, or holds no video.
     """
     interval_us = None if per_second is None else 1e6 / _rate(per_second)
-    trouble = Trouble()
-    first = next(_decoded(path, interval_us, Trouble()), None)
+    trouble = ReadLog()
+    first = next(_decoded(path, interval_us, ReadLog()), None)
     if first is None:
         raise CaptureError("the video holds no frames", where=path, do="copy or convert it again")
     return Recording(
@@ -71,16 +71,16 @@ def open_images(
     per_second: float | None = None,
     times: Path | None = None,
 ) -> Recording:
-    """Open a folder of pictures.
+    """Open a folder of images.
 
     Args:
-        path: The folder; or one that has the pictures in `images/`, and `images.txt`.
+        path: The folder; or one that has the images in `images/`, and `images.txt`.
         unit: Of the times (ns, us, ms, s), where the text does not say.
         per_second: How many were taken per second, where no text says when.
         times: The file that says when, where there are several.
 
     Raises:
-        CaptureError: There are no pictures, or nothing says when they were taken.
+        CaptureError: There are no images, or nothing says when they were taken.
     """
     listed = path / "images.txt"
     if times is None and per_second is None and listed.is_file():
@@ -90,23 +90,23 @@ def open_images(
             list_images(path / "images") if (path / "images").is_dir() else []
         )
         if not files:
-            raise CaptureError("no pictures found", where=path, do="put PNG or JPEG files there")
+            raise CaptureError("no images found", where=path, do="put PNG or JPEG files there")
         opens, closes = _times(files, unit, per_second, times)
     if len(opens) != len(files):
         raise CaptureError(
-            "there must be one time for each picture",
+            "there must be one time for each image",
             where=path,
-            got=f"{len(files)} pictures, {len(opens)} times",
+            got=f"{len(files)} images, {len(opens)} times",
         )
 
     def frames() -> Iterator[Frame]:
         for file, open_us, close_us in zip(files, opens.tolist(), closes.tolist(), strict=True):
             yield Frame(read_image(file), open_us, close_us, file.stem)
 
-    return Recording(path, "pictures", frames=frames, notes={"encoding": "srgb"})
+    return Recording(path, "images", frames=frames, notes={"encoding": "srgb"})
 
 
-def _decoded(path: Path, interval_us: float | None, trouble: Trouble) -> Iterator[Frame]:
+def _decoded(path: Path, interval_us: float | None, trouble: ReadLog) -> Iterator[Frame]:
     """Frames of a video, as far as it can be decoded."""
     count = 0
     try:
@@ -154,9 +154,9 @@ def _times(
     sources = [(times,)] if times is not None else _candidates(folder)
     if len(sources) != 1:
         raise CaptureError(
-            "nothing says when the pictures were taken"
+            "nothing says when the images were taken"
             if not sources
-            else "several files may say when the pictures were taken",
+            else "several files may say when the images were taken",
             where=folder,
             got=", ".join(path.name for source in sources for path in source),
             do="give how many were taken per second, or the file of times"
@@ -167,7 +167,7 @@ def _times(
 
 
 def _candidates(folder: Path) -> list[tuple[Path, ...]]:
-    """Files that may say when the pictures of a folder were taken; starts and ends are two."""
+    """Files that may say when the images of a folder were taken; starts and ends are two."""
     for place in (folder, folder.parent):
         texts = [path for path in sorted(place.glob("*.txt")) if path.name != "images.txt"]
         named = [path for path in texts if re.search("exposure|timestamp|times", path.name, re.I)]
@@ -190,7 +190,7 @@ def _read_times(source: tuple[Path, ...], unit: str | None) -> Times:
             names = ("timestamps", "timestamps")
         if not set(names) <= arrays.keys():
             raise CaptureError(
-                "no times of pictures found", where=source[0], got=", ".join(arrays) or "no arrays"
+                "no times of images found", where=source[0], got=", ".join(arrays) or "no arrays"
             )
         columns, told = [arrays[name].reshape(-1) for name in names], None
     elif len(source) == 2:
@@ -238,7 +238,7 @@ def _table(path: Path) -> tuple[Shaped[np.ndarray, "n k"], str | None]:
 
 
 def _rpg(listed: Path) -> tuple[list[Path], Times]:
-    """Pictures and times of `images.txt`."""
+    """Images and times of `images.txt`."""
     files, seconds = [], []
     for number, line in enumerate(listed.read_text(encoding="utf-8").splitlines()):
         words = line.split(maxsplit=1)
@@ -249,15 +249,15 @@ def _rpg(listed: Path) -> tuple[list[Path], Times]:
             file = listed.parent / words[1].strip()
         except (ValueError, IndexError):
             raise CaptureError(
-                "a line must be a time and the path of a picture",
+                "a line must be a time and the path of a image",
                 where=f"{listed}, line {number + 1}",
                 got=line[:60],
             ) from None
         if not file.resolve().is_relative_to(listed.parent.resolve()):
-            raise CaptureError("a picture lies outside the recording", where=listed, got=file)
+            raise CaptureError("a image lies outside the recording", where=listed, got=file)
         files.append(file)
     if not files:
-        raise CaptureError("no pictures are listed", where=listed)
+        raise CaptureError("no images are listed", where=listed)
     times_us = whole_us(np.array(seconds), "s", listed)
     return files, (times_us, times_us)
 
@@ -266,7 +266,7 @@ def _no_unit(path: Path, column: Shaped[np.ndarray, "n"]) -> CaptureError:
     span = float(column[-1]) - float(column[0])
     lasts = ", ".join(f"{span * UNITS[unit] / 1e6:.4g} s if {unit}" for unit in UNITS)
     return CaptureError(
-        "nothing says in which unit the times of pictures are",
+        "nothing says in which unit the times of images are",
         where=path,
         got=f"{column[0]} to {column[-1]}, which is {lasts}",
         do="give the unit: ns, us, ms or s",
@@ -275,5 +275,5 @@ def _no_unit(path: Path, column: Shaped[np.ndarray, "n"]) -> CaptureError:
 
 def _rate(per_second: float) -> float:
     if not 0 < per_second <= FASTEST:
-        raise OptionError("pictures per second must be between 0 and a million", got=per_second)
+        raise OptionError("images per second must be between 0 and a million", got=per_second)
     return per_second

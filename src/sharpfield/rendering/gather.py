@@ -2,7 +2,7 @@
 
 The heads' activations are the bulk of a training step's memory. They are recomputed in the
 backward pass, chunk by chunk, so that a step keeps only what was looked up. A chunk fits the
-processor's cache, which on a CPU makes this faster than keeping them.
+CPU's cache, which on a CPU makes this faster than keeping them.
 
 Most points are empty or hidden. What sends no light has no colour to speak of, and nothing to
 learn: such points are asked for their density alone, and only those that are left take part in the

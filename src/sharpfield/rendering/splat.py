@@ -75,12 +75,12 @@ class Splatting:
             Radiance `[m, h, w, k]`.
 
         Raises:
-            MissingExtra: On a graphics card, without gsplat.
+            MissingExtra: On a GPU, without gsplat.
             OptionError: The lens sees too wide, see `flattened`.
         """
         if views.device.type == "cuda":
             # The definition would run, and need more memory than any card has.
-            need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
+            need("gsplat", extra="gpu", purpose="drawing Gaussians on a GPU")
         m, k = views.shape
         poses = views.pose.reshape(-1, 3, 4)
         corner, where = views.corner.reshape(-1, 2), None

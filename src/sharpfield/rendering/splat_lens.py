@@ -1,7 +1,7 @@
-"""Pictures through lenses that bend straight lines, taken from pictures that do not.
+"""Images through lenses that bend straight lines, taken from images that do not.
 
-A *flat* picture is one of a pinhole camera. It is drawn just wide enough and fine enough, and every
-pixel of the real camera takes what the flat picture shows where its own ray meets it, between the
+A *flat* image is one of a pinhole camera. It is drawn just wide enough and fine enough, and every
+pixel of the real camera takes what the flat image shows where its own ray meets it, between the
 four nearest flat pixels. The optical axis is the same, so that depth along it stays what it is.
 """
 
@@ -21,7 +21,7 @@ STEEPEST = 5.0
 """Largest distance from the optical axis on the plane z = 1 that is drawn: 79 degrees."""
 
 MOST_PIXELS = 4.0
-"""Pixels of a flat picture, for each of the real one; beyond, it is drawn coarser."""
+"""Pixels of a flat image, for each of the real one; beyond, it is drawn coarser."""
 
 RIM_PX = 2
 """Flat pixels beyond the outermost ray."""
@@ -29,17 +29,17 @@ RIM_PX = 2
 
 @dataclass(frozen=True)
 class Flat:
-    """The flat picture of a camera, and where each pixel of the camera looks on it."""
+    """The flat image of a camera, and where each pixel of the camera looks on it."""
 
     camera: Camera
     """Without distortion."""
     where: Float[Tensor, "h w 2"]
-    """In pixels of the flat picture."""
+    """In pixels of the flat image."""
 
     def canvas(
         self, corner: Int64[Tensor, "v 2"], size: tuple[int, int], *, antialiased: bool
     ) -> tuple[Canvas, Float[Tensor, "v h w 2"]]:
-        """What must be drawn for parts of the real picture, and where their pixels lie on that.
+        """What must be drawn for parts of the real image, and where their pixels lie on that.
 
         Args:
             corner: Pixel at the upper left of each part.
@@ -58,10 +58,10 @@ class Flat:
 
 @lru_cache(maxsize=8)
 def flattened(camera: Camera) -> Flat:
-    """The flat picture for a camera: as fine as the finest part of the real one.
+    """The flat image for a camera: as fine as the finest part of the real one.
 
     Raises:
-        OptionError: The lens sees so wide that no flat picture holds it.
+        OptionError: The lens sees so wide that no flat image holds it.
     """
     ray = camera.direction(camera.grid().double())
     ahead = ray[..., 2:] > 0
@@ -69,7 +69,7 @@ def flattened(camera: Camera) -> Flat:
     if not (plane.norm(dim=-1) < STEEPEST).all():
         angle = torch.rad2deg(torch.acos(ray[..., 2].min()))
         raise OptionError(
-            "the lens sees too wide for pictures of Gaussians",
+            "the lens sees too wide for images of Gaussians",
             got=f"{angle:.0f} degrees from the optical axis at the corner",
             do="crop the recording to 75 degrees, or use a recipe that renders rays",
         )
@@ -77,7 +77,7 @@ def flattened(camera: Camera) -> Flat:
     focal = _finest(plane)
     pixels = float((high - low).prod()) * focal**2
     focal = focal * min(1.0, MOST_PIXELS * camera.width * camera.height / pixels) ** 0.5
-    # Pixels of the two pictures coincide on the axis, where most lenses bend next to nothing.
+    # Pixels of the two images coincide on the axis, where most lenses bend next to nothing.
     cx, cy = (
         centre + ceil(RIM_PX - min(float(edge), 0.0) * focal - centre)
         for edge, centre in zip(low, (camera.cx_px, camera.cy_px), strict=True)
@@ -92,7 +92,7 @@ def flattened(camera: Camera) -> Flat:
 
 
 def resampled(drawn: Drawn, where: Float[Tensor, "v h w 2"]) -> Drawn:
-    """What a drawn picture shows at positions on it, between its four nearest pixels."""
+    """What a drawn image shows at positions on it, between its four nearest pixels."""
     height, width = drawn.opacity.shape[1:]
     flat = torch.cat([drawn.light, drawn.depth[..., None], drawn.opacity[..., None]], -1)
     span = where.new_tensor([width, height])

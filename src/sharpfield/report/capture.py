@@ -8,9 +8,9 @@ from jaxtyping import Shaped
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.report import page
-from sharpfield.report.colormaps import as_display, eight_bit, event_picture
+from sharpfield.report.colormaps import as_display, eight_bit, event_image
 from sharpfield.report.figures import TEST, TRAIN, timeline_figure, trajectory_figure
-from sharpfield.report.page import Look, Picture, section
+from sharpfield.report.page import Image, Look, section
 
 STRIP = 3
 """Frames shown beside the events."""
@@ -20,13 +20,13 @@ EVENTS_US = 20_000
 
 
 def captured(capture: Capture, look: Look) -> str:
-    """Counts, a few recorded frames, an event picture, the camera's path, the timeline."""
+    """Counts, a few recorded frames, an event image, the camera's path, the timeline."""
     keys = (
         f'<p class="keys"><span class="key" style="--of:{TRAIN}">training frames</span>'
         f'<span class="key" style="--of:{TEST}">held out</span></p>'
     )
     small = Look(min(look.longest_px, STRIP_PX), look.quality)
-    strip = "".join(page.figure(picture, small) for picture in _strip(capture))
+    strip = "".join(page.figure(image, small) for image in _strip(capture))
     return section(
         "What was captured",
         page.definitions(_counts(capture)),
@@ -68,26 +68,26 @@ def _counts(capture: Capture) -> dict[str, object]:
     return counts
 
 
-def _strip(capture: Capture) -> list[Picture]:
+def _strip(capture: Capture) -> list[Image]:
     """Some recorded training frames, and after the first its camera's events around its middle."""
     frames, events = capture.frames, capture.events
-    pictures, middle_us, camera = [], None, 0
+    images, middle_us, camera = [], None, 0
     for i in evenly_spread(capture.split.train, STRIP) if frames is not None else []:
         assert frames is not None
         duration = frames.exposure.duration_us[i] / 1000
         caption = f"frame {frames.names[i]}" + (f", {duration:g} ms" if duration else "")
         pixels = eight_bit(as_display(frames.images[i]).numpy())
-        pictures.append(Picture("frame", pixels, caption, f"Recorded {caption}"))
+        images.append(Image("frame", pixels, caption, f"Recorded {caption}"))
         if middle_us is None:
             middle_us, camera = int(frames.exposure.middle_us[i]), int(frames.track[i])
     if events is not None and len(events):
         if middle_us is None:
             middle_us = int(events.t_us[0] + events.t_us[-1]) // 2
         seen = events if events.track is None else events.of_track(camera)
-        pixels = event_picture(seen, middle_us - EVENTS_US // 2, middle_us + EVENTS_US // 2)
+        pixels = event_image(seen, middle_us - EVENTS_US // 2, middle_us + EVENTS_US // 2)
         caption = f"events of {EVENTS_US / 1000:g} ms: red brighter, blue darker"
-        pictures.insert(1, Picture("events", pixels, caption, f"E{caption[1:]}"))
-    return pictures
+        images.insert(1, Image("events", pixels, caption, f"E{caption[1:]}"))
+    return images
 
 
 def _span(values: Shaped[np.ndarray, "n"] | Sequence[float]) -> str:

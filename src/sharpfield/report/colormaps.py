@@ -1,4 +1,4 @@
-"""Numbers as colours: depth, errors, events. All pictures are uint8 RGB, `[h w 3]`."""
+"""Numbers as colours: depth, errors, events. All images are uint8 RGB, `[h w 3]`."""
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ def colour_error(
     return _mapped(np.abs(predicted - truth).mean(-1) / ERROR_WHITE, cv2.COLORMAP_INFERNO)
 
 
-def event_picture(events: EventStream, start_us: int, end_us: int) -> Colours:
+def event_image(events: EventStream, start_us: int, end_us: int) -> Colours:
     """Events of a time window on white: red where more got brighter, blue where more got darker.
 
     The colour is full where the sum of signs reaches its 90th percentile.
@@ -58,9 +58,9 @@ def colour_signs(total: Shaped[np.ndarray, "h w"], full: float) -> Colours:
     return mixed.round().astype(np.uint8)
 
 
-def eight_bit(picture: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-    """A picture in 0...1 rounded to 8 bit."""
-    return np.rint(picture * 255).astype(np.uint8)
+def eight_bit(image: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+    """A image in 0...1 rounded to 8 bit."""
+    return np.rint(image * 255).astype(np.uint8)
 
 
 def _mapped(level: Shaped[np.ndarray, "h w"], colours: int) -> Colours:

@@ -4,8 +4,8 @@ A folder of them holds
 
     counts.npy      int32 [n h w 2]: darker and brighter, all that happened
     frames.npy      int32 [n h w]: brighter minus darker, without few events if that is asked
-    0000.png ...    the same as pictures: red brighter, blue darker, one scale for all
-    frames.mp4      the pictures one after another
+    0000.png ...    the same as images: red brighter, blue darker, one scale for all
+    frames.mp4      the images one after another
 
 Source: EvDNeRF (WACV 2024), whose figures leave out pixels with few events (`without_few`).
 """
@@ -24,16 +24,16 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.events.image import splat_nearest
 from sharpfield.report.colormaps import FULL, colour_signs
-from sharpfield.report.video import Picture, write_film
+from sharpfield.report.video import Image, write_video
 from sharpfield.storage.images import write_image
 
-COUNTS, FRAMES, FILM = "counts.npy", "frames.npy", "frames.mp4"
+COUNTS, FRAMES, VIDEO = "counts.npy", "frames.npy", "frames.mp4"
 
 PUBLISHED_SHARE = 0.3
 """Least share of a frame's largest count that the published figures show."""
 
 RATE = 20.0
-"""Windows per second of the film."""
+"""Windows per second of the video."""
 
 Append = Callable[[Int32[np.ndarray, "h w 2"]], None]
 """Takes the counts of the next window."""
@@ -59,7 +59,7 @@ def without_few(
 
     Args:
         frames: Signed counts.
-        least_share: Smallest share that is kept; `PUBLISHED_SHARE` is what the released pictures
+        least_share: Smallest share that is kept; `PUBLISHED_SHARE` is what the released images
             of EvDNeRF show, 0 keeps all.
     """
     most = np.abs(frames).max((-2, -1), keepdims=True)
@@ -77,13 +77,13 @@ def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
 def writing_frames(folder: Path, number: int, *, least_share: float = 0.0) -> Iterator[Append]:
     """What takes the counts of each window; the folder appears whole, at the end, or not at all.
 
-    Memory is that of one frame: arrays grow on disk, and pictures, which share a scale, are drawn
+    Memory is that of one frame: arrays grow on disk, and images, which share a scale, are drawn
     at the end.
 
     Args:
         folder: Replaced if it holds event frames.
         number: Of windows; as many must come.
-        least_share: See `without_few`; of frames and pictures, not of counts.
+        least_share: See `without_few`; of frames and images, not of counts.
 
     Raises:
         OptionError: The folder is there and holds something else.
@@ -138,15 +138,15 @@ def _full(histogram: Int64[np.ndarray, "n"]) -> float:
 
 
 def _draw(folder: Path, frames: Int32[np.ndarray, "n h w"], full: float) -> None:
-    """Pictures of frames, and a film of the pictures."""
+    """Images of frames, and a video of the images."""
 
-    def drawn() -> Iterator[Picture]:
+    def drawn() -> Iterator[Image]:
         for number, frame in enumerate(frames):
-            picture = colour_signs(np.asarray(frame), full)
-            write_image(folder / f"{number:04d}.png", picture)
-            yield picture
+            image = colour_signs(np.asarray(frame), full)
+            write_image(folder / f"{number:04d}.png", image)
+            yield image
 
-    write_film(folder / FILM, drawn(), rate=RATE)
+    write_video(folder / VIDEO, drawn(), rate=RATE)
 
 
 def busy(frames: Int32[np.ndarray, "*n h w"]) -> float:

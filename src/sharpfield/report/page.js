@@ -1,11 +1,11 @@
-// Above each group of views, a slider that compares any two pictures of one view.
-// Without this script the pictures stand side by side.
+// Above each group of views, a slider that compares any two images of one view.
+// Without this script the images stand side by side.
 "use strict";
 for (const group of document.querySelectorAll(".compare")) {
   const views = [...group.querySelectorAll(".view")];
   const kinds = [];
-  for (const picture of group.querySelectorAll("figure"))
-    if (!kinds.includes(picture.dataset.kind)) kinds.push(picture.dataset.kind);
+  for (const image of group.querySelectorAll("figure"))
+    if (!kinds.includes(image.dataset.kind)) kinds.push(image.dataset.kind);
   if (views.length && kinds.length > 1) enhance(group, views, kinds);
 }
 
@@ -40,14 +40,14 @@ function enhance(group, views, kinds) {
   };
   const show = () => {
     const chosen = views[view.value];
-    const picture = (kind) => chosen.querySelector(`[data-kind="${CSS.escape(kind)}"] img`);
+    const image = (kind) => chosen.querySelector(`[data-kind="${CSS.escape(kind)}"] img`);
     const put = (image, from, kind, tag) => {
       if (from) { image.src = from.src; image.alt = from.alt; }
       image.style.visibility = from ? "" : "hidden";
       tag.textContent = from ? kind : kind + " (none)";
     };
-    put(find(".over"), picture(left.value), left.value, find(".tag.left"));
-    put(find(".under"), picture(right.value), right.value, find(".tag.right"));
+    put(find(".over"), image(left.value), left.value, find(".tag.left"));
+    put(find(".under"), image(right.value), right.value, find(".tag.right"));
     range.setAttribute("aria-label", `Compare ${left.value} and ${right.value}`);
     for (const one of views) one.classList.toggle("chosen", one === chosen);
     move();

@@ -1,4 +1,4 @@
-"""Building blocks of a single-file page: pictures inside it, figures, sliders, tables."""
+"""Building blocks of a single-file page: images inside it, figures, sliders, tables."""
 
 import base64
 import html
@@ -18,7 +18,7 @@ Colours = UInt8[np.ndarray, "h w c"]
 
 @dataclass(frozen=True)
 class Look:
-    """How much room pictures may take."""
+    """How much room images may take."""
 
     longest_px: int
     quality: int
@@ -26,11 +26,11 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture with what it shows."""
+class Image:
+    """A image with what it shows."""
 
     kind: str
-    """What it is among the pictures of its view, e.g. `result`."""
+    """What it is among the images of its view, e.g. `result`."""
     pixels: Colours
     caption: str
     alt: str
@@ -38,14 +38,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class View:
-    """Pictures of the same place at the same time, to be compared."""
+    """Images of the same place at the same time, to be compared."""
 
     name: str
-    pictures: tuple[Picture, ...]
+    images: tuple[Image, ...]
 
 
 def embedded(pixels: Colours, look: Look) -> str:
-    """A picture as the address of itself."""
+    """A image as the address of itself."""
     height, width = pixels.shape[:2]
     shrink = min(1.0, look.longest_px / max(height, width))
     if shrink < 1:
@@ -57,14 +57,14 @@ def embedded(pixels: Colours, look: Look) -> str:
     return "data:image/webp;base64," + base64.b64encode(data.tobytes()).decode()
 
 
-def figure(picture: Picture, look: Look) -> str:
-    """A picture with its caption."""
-    height, width = picture.pixels.shape[:2]
+def figure(image: Image, look: Look) -> str:
+    """A image with its caption."""
+    height, width = image.pixels.shape[:2]
     return (
-        f'<figure data-kind="{html.escape(picture.kind)}">'
-        f'<img src="{embedded(picture.pixels, look)}" width="{width}" height="{height}"'
-        f' alt="{html.escape(picture.alt)}" loading="lazy">'
-        f"<figcaption>{html.escape(picture.caption)}</figcaption></figure>"
+        f'<figure data-kind="{html.escape(image.kind)}">'
+        f'<img src="{embedded(image.pixels, look)}" width="{width}" height="{height}"'
+        f' alt="{html.escape(image.alt)}" loading="lazy">'
+        f"<figcaption>{html.escape(image.caption)}</figcaption></figure>"
     )
 
 
@@ -75,8 +75,8 @@ def drawing(svg: str | None, caption: str) -> str:
     return f'<figure class="drawing">{svg}<figcaption>{html.escape(caption)}</figcaption></figure>'
 
 
-def film(data: bytes, caption: str) -> str:
-    """An mp4 film with its caption, played over and over without sound."""
+def video(data: bytes, caption: str) -> str:
+    """An mp4 video with its caption, played over and over without sound."""
     told = html.escape(caption)
     address = "data:video/mp4;base64," + base64.b64encode(data).decode()
     return (
@@ -86,18 +86,18 @@ def film(data: bytes, caption: str) -> str:
 
 
 def comparison(views: Sequence[View], look: Look, *, left: str, right: str, first: str = "") -> str:
-    """Views in rows of pictures; with JavaScript, a slider above them compares any two.
+    """Views in rows of images; with JavaScript, a slider above them compares any two.
 
     Args:
         views: What to compare.
-        look: Of the pictures.
-        left: Kind of the picture on the slider's left at first.
+        look: Of the images.
+        left: Kind of the image on the slider's left at first.
         right: And on its right.
         first: Name of the view to begin with; the first in order if there is none of it.
     """
     rows = "\n".join(
         f'<div class="view" data-name="{html.escape(view.name)}">'
-        + "".join(figure(picture, look) for picture in view.pictures)
+        + "".join(figure(image, look) for image in view.images)
         + "</div>"
         for view in views
     )

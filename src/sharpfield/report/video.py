@@ -1,7 +1,7 @@
-"""Films: pictures written one after another, as they are made, to a file or a folder.
+"""Videos: images written one after another, as they are made, to a file or a folder.
 
 `FILE.mp4` holds H.264 in the pixel format that every browser plays; any other path is a folder
-that gets one PNG per picture. Either appears whole, at the end, or not at all.
+that gets one PNG per image. Either appears whole, at the end, or not at all.
 """
 
 from collections.abc import Iterable, Iterator
@@ -23,48 +23,48 @@ from sharpfield.storage.images import list_images, write_image
 QUALITY = 18
 """Constant rate factor of x264: visually lossless."""
 
-Picture = UInt8[np.ndarray, "h w c"]
+Image = UInt8[np.ndarray, "h w c"]
 
 
 class Writer(Protocol):
-    """Takes the pictures of a film in order."""
+    """Takes the images of a video in order."""
 
-    def __call__(self, picture: Picture) -> None:
-        """Append one picture, RGB or grey."""
+    def __call__(self, image: Image) -> None:
+        """Append one image, RGB or grey."""
         ...
 
 
 @contextmanager
-def film(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
-    """A writer of pictures, all of one size.
+def video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
+    """A writer of images, all of one size.
 
     Args:
-        path: Ends in `.mp4` for a film; anything without a suffix is a folder of PNGs.
-        rate: Pictures per second.
+        path: Ends in `.mp4` for a video; anything without a suffix is a folder of PNGs.
+        rate: Images per second.
 
     Raises:
         OptionError: Another suffix, a rate that is not positive, or a folder with other files.
     """
     if path.suffix.lower() == ".mp4":
         if not rate > 0:
-            raise OptionError("a film needs a positive rate", got=rate)
+            raise OptionError("a video needs a positive rate", got=rate)
         with _mp4(path, rate) as write:
             yield write
     elif path.suffix and not path.is_dir():
         raise OptionError(
-            "unknown kind of film", where=path, do="name a file FILE.mp4, or a folder for PNGs"
+            "unknown kind of video", where=path, do="name a file FILE.mp4, or a folder for PNGs"
         )
     else:
         with _folder(path) as write:
             yield write
 
 
-def write_film(path: Path, pictures: Iterable[Picture], *, rate: float = 30.0) -> int:
-    """Write pictures as they come; returns how many. See `film`."""
+def write_video(path: Path, images: Iterable[Image], *, rate: float = 30.0) -> int:
+    """Write images as they come; returns how many. See `video`."""
     count = 0
-    with film(path, rate=rate) as write:
-        for picture in pictures:
-            write(picture)
+    with video(path, rate=rate) as write:
+        for image in images:
+            write(image)
             count += 1
     return count
 
@@ -75,9 +75,9 @@ def _folder(path: Path) -> Iterator[Writer]:
     with replacing_folder(path) as temporary:
         count = 0
 
-        def write(picture: Picture) -> None:
+        def write(image: Image) -> None:
             nonlocal count
-            write_image(temporary / f"{count:04d}.png", picture)
+            write_image(temporary / f"{count:04d}.png", image)
             count += 1
 
         yield write
@@ -90,17 +90,17 @@ def _mp4(path: Path, rate: float) -> Iterator[Writer]:
             stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
             _set_up(stream.codec_context)
 
-            def write(picture: Picture) -> None:
-                even = _even(picture)
+            def write(image: Image) -> None:
+                even = _even(image)
                 if not stream.codec_context.is_open:
                     stream.height, stream.width = even.shape[:2]
-                assert even.shape[:2] == (stream.height, stream.width), "pictures differ in size"
+                assert even.shape[:2] == (stream.height, stream.width), "images differ in size"
                 frame = av.VideoFrame.from_ndarray(even, format="rgb24")
                 frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
                 file.mux(stream.encode(frame))
 
             yield write
-            assert stream.codec_context.is_open, "a film needs at least one picture"
+            assert stream.codec_context.is_open, "a video needs at least one image"
             file.mux(stream.encode())
 
 
@@ -110,10 +110,10 @@ def _set_up(encoder: VideoCodecContext) -> None:
     encoder.colorspace = encoder.color_primaries = encoder.color_trc = encoder.color_range = 1
 
 
-def _even(picture: Picture) -> UInt8[np.ndarray, "even_h even_w 3"]:
+def _even(image: Image) -> UInt8[np.ndarray, "even_h even_w 3"]:
     """RGB with an even number of rows and columns, as H.264 needs: the last ones are repeated."""
-    height, width, _ = picture.shape
-    rgb = np.broadcast_to(picture, (height, width, 3))
+    height, width, _ = image.shape
+    rgb = np.broadcast_to(image, (height, width, 3))
     return np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
@@ -123,7 +123,7 @@ def _expect_replaceable(path: Path) -> None:
     if path.is_dir() and {p for p in path.iterdir()} <= set(list_images(path)):
         return
     raise OptionError(
-        "will not replace a folder that holds other things than pictures",
+        "will not replace a folder that holds other things than images",
         where=path,
         do="choose another place, or empty it",
     )

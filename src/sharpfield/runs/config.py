@@ -16,7 +16,7 @@ FILE = "recipe.json"
 
 
 @dataclass(frozen=True)
-class Started:
+class RunConfig:
     """Everything needed to build a run's model again."""
 
     name: str
@@ -46,12 +46,12 @@ class Started:
         }
 
 
-def write_started(run: Path, started: Started) -> None:
+def write_run_config(run: Path, started: RunConfig) -> None:
     """Write `RUN/recipe.json`."""
     write_json(run / FILE, started.settings())
 
 
-def read_started(run: Path) -> Started:
+def read_run_config(run: Path) -> RunConfig:
     """Read `RUN/recipe.json`.
 
     Raises:
@@ -61,7 +61,7 @@ def read_started(run: Path) -> Started:
     try:
         table = json.loads(path.read_text())
         recipe = from_table(recipe_named(table["recipe"]), table["options"])
-        return Started(
+        return RunConfig(
             table["recipe"],
             recipe,
             table["capture"],

@@ -17,7 +17,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.evaluation.report import Story, write_report
 from sharpfield.evaluation.views import validation
-from sharpfield.runs.config import Started, read_started, write_started
+from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.plan import Options
 from sharpfield.training.record import Ledger, read_ledger
@@ -27,7 +27,7 @@ STREAMS = ("frames", "events")
 
 
 @dataclass(frozen=True)
-class Reading:
+class ReadOptions:
     """How to read a capture, where its layout is not to be believed."""
 
     layout: str | None = None
@@ -52,10 +52,10 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenedRun:
     """A trained run."""
 
-    started: Started
+    started: RunConfig
     model: Any
     capture: Capture
     """All of it, or its block; also what the model did not use."""
@@ -109,7 +109,7 @@ def part_of(capture: Capture, block: str) -> Capture:
 
 
 def start(
-    started: Started,
+    started: RunConfig,
     capture: Capture,
     run: Path,
     options: Options,
@@ -126,7 +126,7 @@ def start(
 
     if not options.resume:
         require_unused(run)
-        write_started(run, started)
+        write_run_config(run, started)
     return train(
         build,
         run,
@@ -138,7 +138,7 @@ def start(
     )
 
 
-def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") -> Opened:
+def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") -> OpenedRun:
     """A run with its trained weights.
 
     Args:
@@ -149,7 +149,7 @@ def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") ->
     Raises:
         RunError: The run has no checkpoint yet, or is damaged.
     """
-    started, ledger = read_started(run), read_ledger(run)
+    started, ledger = read_run_config(run), read_ledger(run)
     if ledger is None:
         raise RunError("this run has not begun", where=run, do="train it first")
     source = Path(started.capture) if capture is None else capture
@@ -165,11 +165,11 @@ def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") ->
         used(whole, started.use), started.seed
     )
     restore_weights(load(file_of(run, "last")), model)
-    return Opened(started, model.to(device_named(device)), whole)
+    return OpenedRun(started, model.to(device_named(device)), whole)
 
 
 def measure(
-    opened: Opened,
+    opened: OpenedRun,
     run: Path,
     console: Console,
     *,

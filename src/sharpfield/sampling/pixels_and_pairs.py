@@ -83,7 +83,7 @@ def pixel_table(
 
     Args:
         capture: Must have frames.
-        images: Other pictures to take values from, e.g. deblurred ones; 0...1 if they are floats.
+        images: Other images to take values from, e.g. deblurred ones; 0...1 if they are floats.
 
     Raises:
         CaptureError: No frame is for training.

@@ -1,7 +1,7 @@
 """What the steps of a moving scene look at: the same moments, seen by several cameras.
 
 A *rig* is all cameras of a capture, each on a track of its own. A *look* is a few instants, the
-same for all cameras it takes: the frames of one moment, the sharp pictures that events carry to
+same for all cameras it takes: the frames of one moment, the sharp images that events carry to
 any instant, and the events that each pixel counts between two instants.
 """
 
@@ -19,17 +19,17 @@ from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.seed import numpy_generator
 from sharpfield.events.counts import counts_between
 from sharpfield.events.index import EventIndex
-from sharpfield.events.latent_frames import Belief, SharpInstants
+from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import phase_at
-from sharpfield.sampling.views import ROUNDED, spread_over
+from sharpfield.sampling.views import ROUNDED, stratified_times
 from sharpfield.storage.event_cache import event_index
 
 Times = Int64[np.ndarray, "_"]
 
 
 @dataclass(frozen=True)
-class RigLookOptions:
+class RigSamplingOptions:
     """What a step looks at, and how each part of it counts."""
 
     cameras: int = 2
@@ -39,9 +39,9 @@ class RigLookOptions:
     draws: int = 3
     """Views drawn for each of those of an exposure."""
     early: float = 0.7
-    """Part of the schedule that looks at single instants, if events can make sharp pictures."""
+    """Part of the schedule that looks at single instants, if events can make sharp images."""
     sharp: float = 0.05
-    """Weight of the sharp pictures from events beside a blurred frame; alone it is 1. 0 leaves them
+    """Weight of the sharp images from events beside a blurred frame; alone it is 1. 0 leaves them
     out altogether."""
     windows: float = 0.03
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
@@ -58,7 +58,7 @@ class RigLookOptions:
 
 
 @dataclass(frozen=True)
-class Seat:
+class CameraStreams:
     """What one camera of the rig recorded."""
 
     motion: EventMotion | None
@@ -66,7 +66,7 @@ class Seat:
     sharp: SharpInstants | None
 
 
-class RigLooks:
+class RigViewSampler:
     """Draws looks, each as a function of the seed and the step.
 
     Args:
@@ -79,7 +79,7 @@ class RigLooks:
     """
 
     def __init__(
-        self, options: RigLookOptions, capture: Capture, seed: int, *, steps: int, offset: bool
+        self, options: RigSamplingOptions, capture: Capture, seed: int, *, steps: int, offset: bool
     ) -> None:
         self.options, self.capture, self.seed = options, capture, seed
         frames, events = capture.frames, capture.events
@@ -89,51 +89,51 @@ class RigLooks:
             raise CaptureError(
                 "no frame is left to learn from", where=capture.name, got="all are held out"
             )
-        self.seats = {} if events is None else _seats(capture, options.sharp > 0)
+        self.camera_streams = {} if events is None else _seats(capture, options.sharp > 0)
         self.shown = np.zeros(0, np.int64)  # tracks with frames to learn from
         if frames is not None:
             self.shown = np.unique(frames.track[capture.split.train])
-        both = all(int(track) in self.seats for track in self.shown)
-        pictures = [t for t, seat in self.seats.items() if seat.sharp is not None]
-        self.sharp = pictures if both else []
+        both = all(int(track) in self.camera_streams for track in self.shown)
+        images = [t for t, seat in self.camera_streams.items() if seat.sharp is not None]
+        self.sharp = images if both else []
         self.late_from = int(options.early * steps) if self.sharp else 0
-        counted = bool(self.seats) and options.windows > 0
+        counted = bool(self.camera_streams) and options.windows > 0
         self.together = counted and both and not offset
         self.apart = counted and not self.together
         still = frames is not None and bool(frames.exposure.instant.all())
-        self.pictured = self.together and still and bool(self.sharp)
+        self.imaged = self.together and still and bool(self.sharp)
 
-    def draw(self, step: int, belief: Belief) -> Batch:
+    def draw(self, step: int, sensor_estimate: SensorEstimate) -> Batch:
         """One instant in early steps; in late ones an exposure, or a stretch of events."""
         random = numpy_generator(self.seed, step, "look")
         if step < self.late_from:
-            return self._instant(random, belief)
+            return self._instant(random, sensor_estimate)
         if self.capture.frames is None or (self.apart and step % 2):
             return self._stretch(random)
-        if self.pictured:
-            return self._change(random, belief)
-        return self._exposure(random, belief)
+        if self.imaged:
+            return self._change(random, sensor_estimate)
+        return self._exposure(random, sensor_estimate)
 
-    def _instant(self, random: np.random.Generator, belief: Belief) -> Batch:
-        """A sharp picture of each of several cameras, at one instant."""
+    def _instant(self, random: np.random.Generator, sensor_estimate: SensorEstimate) -> Batch:
+        """A sharp image of each of several cameras, at one instant."""
         tracks = self._cameras(random, np.array(self.sharp))
         times = random.integers(*self._span_us(tracks), size=1, endpoint=True)
         return {
             "look": self._instants(times, np.ones(1), tracks),
-            "sharp": self._sharp(times, tracks, belief),
+            "sharp": self._sharp(times, tracks, sensor_estimate),
         }
 
-    def _change(self, random: np.random.Generator, belief: Belief) -> Batch:
-        """Sharp pictures of several cameras at two instants, and the events between them."""
+    def _change(self, random: np.random.Generator, sensor_estimate: SensorEstimate) -> Batch:
+        """Sharp images of several cameras at two instants, and the events between them."""
         tracks = self._cameras(random, np.array(self.sharp))
         times = self._within(random, self._span_us(tracks), 2)
         return {
             "look": self._instants(times, np.ones(2), tracks),
-            "sharp": self._sharp(times, tracks, belief),
+            "sharp": self._sharp(times, tracks, sensor_estimate),
             "events": self._windows(times, tracks),
         }
 
-    def _exposure(self, random: np.random.Generator, belief: Belief) -> Batch:
+    def _exposure(self, random: np.random.Generator, sensor_estimate: SensorEstimate) -> Batch:
         """Frames of one moment; with events of an instant beside it."""
         options, frames = self.options, self.capture.needed_frames
         train, exposure = self.capture.split.train, self.capture.needed_frames.exposure
@@ -144,7 +144,7 @@ class RigLooks:
         group = np.concatenate([[chosen], others])
         tracks = frames.track[group]
         few, draws = (options.instants, options.draws) if opens < closes else (1, 1)
-        times, rest = spread_over((opens, closes), few, draws, random)
+        times, rest = stratified_times((opens, closes), few, draws, random)
         weight = np.full(few, 1 / few)
         if self.together:
             times, weight = self._with_one_beside(random, times, weight, (opens, closes))
@@ -156,14 +156,14 @@ class RigLooks:
             share = np.full(len(rest), 1 / (few * draws))
             batch["rest"] = self._instants(rest, share, tracks)
         if self.sharp and opens < closes:
-            batch["sharp"] = self._sharp(times, tracks, belief)
+            batch["sharp"] = self._sharp(times, tracks, sensor_estimate)
         if self.together:
             batch["events"] = self._windows(times, tracks)
         return batch
 
     def _stretch(self, random: np.random.Generator) -> Batch:
         """A stretch of events of any length, cut into windows."""
-        tracks = self._cameras(random, np.array(list(self.seats)))
+        tracks = self._cameras(random, np.array(list(self.camera_streams)))
         t_us = self.capture.needed_events.t_us
         span_us = int(t_us[0]), int(t_us[-1])
         times = self._within(random, span_us, max(self.options.instants, 2))
@@ -182,8 +182,8 @@ class RigLooks:
         return np.rint(np.linspace(start, start + length, count)).astype(np.int64)
 
     def _span_us(self, tracks: np.ndarray) -> tuple[int, int]:
-        """From when until when all of some cameras have sharp pictures."""
-        spans = np.array([self._pictures(t).span_us for t in tracks.tolist()])
+        """From when until when all of some cameras have sharp images."""
+        spans = np.array([self._images(t).span_us for t in tracks.tolist()])
         first = int(spans[:, 0].max())
         return first, max(int(spans[:, 1].min()), first)
 
@@ -193,8 +193,8 @@ class RigLooks:
         most = self.options.cameras if most is None else most
         return random.permutation(among)[: max(most, 0)]
 
-    def _pictures(self, track: int) -> SharpInstants:
-        found = self.seats[track].sharp
+    def _images(self, track: int) -> SharpInstants:
+        found = self.camera_streams[track].sharp
         assert found is not None
         return found
 
@@ -233,11 +233,11 @@ class RigLooks:
         when = self.capture.frame_time[torch.from_numpy(group)]
         return self._pixels(value, frames.track[group], group, (when[:, 0], when[:, 1]))
 
-    def _sharp(self, times: Times, tracks: np.ndarray, belief: Belief) -> Pixels:
-        """Sharp pictures `[m, h, w, k]` at some instants."""
+    def _sharp(self, times: Times, tracks: np.ndarray, sensor_estimate: SensorEstimate) -> Pixels:
+        """Sharp images `[m, h, w, k]` at some instants."""
         value = torch.stack(
             [
-                torch.stack([self._pictures(t).at(int(at), belief) for at in times], 2)
+                torch.stack([self._images(t).at(int(at), sensor_estimate) for at in times], 2)
                 for t in tracks.tolist()
             ]
         )
@@ -271,7 +271,9 @@ class RigLooks:
 
     def _windows(self, times: Times, tracks: np.ndarray) -> EventPairs:
         """Events at every pixel between instants, `[m, k - 1, h, w, 1]`."""
-        found = [_counted(self.seats[track], times, self.capture) for track in tracks.tolist()]
+        found = [
+            _counted(self.camera_streams[track], times, self.capture) for track in tracks.tolist()
+        ]
         negative, positive, slack = (torch.stack(part) for part in zip(*found, strict=True))
         shape = negative.shape
         time = torch.from_numpy(self.capture.clock.unit(times)).float()[:, None, None, None]
@@ -287,7 +289,7 @@ class RigLooks:
         )
 
 
-def _counted(seat: Seat, times: Times, capture: Capture) -> tuple[Tensor, Tensor, Tensor]:
+def _counted(seat: CameraStreams, times: Times, capture: Capture) -> tuple[Tensor, Tensor, Tensor]:
     """Events to darker and to brighter, and their slack, of one camera `[k - 1, h, w, 1]`."""
     assert seat.motion is not None and seat.index is not None
     counted = [
@@ -304,8 +306,8 @@ def _counted(seat: Seat, times: Times, capture: Capture) -> tuple[Tensor, Tensor
     return negative, positive, ROUNDED * (unknown[1:] + unknown[:-1])
 
 
-def _seats(capture: Capture, sharp: bool) -> dict[int, Seat]:
-    """What each camera recorded that has events; with sharp pictures where it has frames, too.
+def _seats(capture: Capture, sharp: bool) -> dict[int, CameraStreams]:
+    """What each camera recorded that has events; with sharp images where it has frames, too.
 
     Raises:
         CaptureError: Events have colours or are rectified.
@@ -316,9 +318,9 @@ def _seats(capture: Capture, sharp: bool) -> dict[int, Seat]:
             "moving Gaussians need events that name pixels of grey sensors",
             where=capture.name,
             got="colour filters" if events.coloured else "rectified positions",
-            do="train evdnerf-physical, which knows neither as pictures; or --use frames",
+            do="train evdnerf-physical, which knows neither as images; or --use frames",
         )
-    seats = {}
+    camera_streams = {}
     for track in range(events.tracks):
         own = events.of_track(track)
         if not len(own):
@@ -328,8 +330,8 @@ def _seats(capture: Capture, sharp: bool) -> dict[int, Seat]:
         index = event_index(motion.events)
         mine = _frames_of(alone, track)
         found = None if mine is None or not sharp else SharpInstants(mine, motion, index)
-        seats[track] = Seat(motion, index, found)
-    return seats
+        camera_streams[track] = CameraStreams(motion, index, found)
+    return camera_streams
 
 
 def _frames_of(capture: Capture, track: int) -> Capture | None:

@@ -1,7 +1,7 @@
 """What the steps of a splat recipe look at: whole images at a few instants.
 
 A *look* is the instants whose views a step draws, with what was measured of them: the blurred frame
-of an exposure, the sharp pictures that events make of it, and the *windows*, which are the events
+of an exposure, the sharp images that events make of it, and the *windows*, which are the events
 counted at every pixel between two instants that follow each other. A look at a part of the image
 costs less.
 """
@@ -19,7 +19,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
 from sharpfield.core.seed import number, numpy_generator
 from sharpfield.events.counts import counts_between
-from sharpfield.events.latent_frames import Belief, SharpInstants
+from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import phase_at
 from sharpfield.ops.permutation import shuffled
@@ -33,10 +33,10 @@ Times = Int64[np.ndarray, "_"]
 
 
 @dataclass(frozen=True)
-class LookOptions:
+class SamplingOptions:
     """What a step looks at, and how each part of it counts.
 
-    Where events can make sharp pictures, *early* steps look at one instant, drawn from the whole
+    Where events can make sharp images, *early* steps look at one instant, drawn from the whole
     capture: cheap, and from everywhere. *Late* steps look at one exposure.
     """
 
@@ -48,11 +48,11 @@ class LookOptions:
     draws: int = 3
     """Views drawn for each of those: light adds up over many, a gradient can do with few."""
     early: float = 0.6
-    """Part of the schedule that looks at single instants, if events can make sharp pictures."""
+    """Part of the schedule that looks at single instants, if events can make sharp images."""
     still: float = 0.0
     """Part of the schedule that takes frames as if they were sharp: a view instead of several."""
     sharp: float = 0.05
-    """Weight of the sharp pictures from events in late steps; in early ones it is 1. 0 leaves them
+    """Weight of the sharp images from events in late steps; in early ones it is 1. 0 leaves them
     out altogether."""
     windows: float = 0.03
     """Weight of the squared error of the number of events between instants; 0 leaves them out."""
@@ -66,8 +66,8 @@ class LookOptions:
     """Most length of a stretch of events."""
     depth: float = 0.0
     """Weight of what a depth camera measured, in late steps."""
-    quality: Literal["even", "auto", "pictures", "events"] = "even"
-    """Which frames are looked at more often: none; those that events, or else pictures, say are
+    quality: Literal["even", "auto", "images", "events"] = "even"
+    """Which frames are looked at more often: none; those that events, or else images, say are
     sharp; those that look sharp; those with few events during the exposure."""
     part: int = 0
     """Side of the square part of the image that a step looks at, in pixels; 0 takes the image."""
@@ -87,7 +87,7 @@ class Part:
         return image[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
-class Looks:
+class ViewSampler:
     """Draws looks, each as a function of the seed and the step.
 
     Args:
@@ -99,7 +99,7 @@ class Looks:
 
     def __init__(
         self,
-        options: LookOptions,
+        options: SamplingOptions,
         capture: Capture,
         seed: int,
         weights: Float64[np.ndarray, "n"] | None = None,
@@ -134,18 +134,20 @@ class Looks:
         if options.depth > 0 and capture.depth is not None:
             self.depth = MeasuredDepth(capture.depth, capture.camera)
 
-    def instant(self, step: int, belief: Belief) -> Batch:
-        """A single view of a sharp picture, anywhere between the first and the last exposure."""
+    def instant(self, step: int, sensor_estimate: SensorEstimate) -> Batch:
+        """A single view of a sharp image, anywhere between the first and the last exposure."""
         assert self.sharp is not None
         random = numpy_generator(self.seed, step, "look")
         times = random.integers(*self.sharp.span_us, size=1, endpoint=True)
         part, frame = self._part(random), int(self.sharp.order[0])
         return {
             "look": self._instants(times, np.ones(1), frame, part),
-            "sharp": self._sharp(times, frame, part, belief),
+            "sharp": self._sharp(times, frame, part, sensor_estimate),
         }
 
-    def exposure(self, step: int, *, events: bool, belief: Belief, still: bool = False) -> Batch:
+    def exposure(
+        self, step: int, *, events: bool, sensor_estimate: SensorEstimate, still: bool = False
+    ) -> Batch:
         """Views of one exposure, or only its middle; and with events of an instant beside it."""
         random = numpy_generator(self.seed, step, "look")
         frames, part = self.capture.needed_frames, self._part(random)
@@ -153,7 +155,7 @@ class Looks:
         opens, closes = frames.exposure.window(frame)
         moved = self.options.blur == "motion" and opens < closes and not still
         few, draws = (self.options.instants, self.options.draws) if moved else (1, 1)
-        times, rest = spread_over((opens, closes), few, draws, random)
+        times, rest = stratified_times((opens, closes), few, draws, random)
         weight = np.full(few, 1 / few)
         windows = events and self.motion is not None and self.options.windows > 0
         if windows:
@@ -166,7 +168,7 @@ class Looks:
             share = 1 / (few * draws)
             batch["rest"] = self._instants(rest, np.full(len(rest), share), frame, part)
         if self.sharp is not None:
-            batch["sharp"] = self._sharp(times, frame, part, belief)
+            batch["sharp"] = self._sharp(times, frame, part, sensor_estimate)
         if windows:
             batch["events"] = self._windows(times, part)
         if self.depth is not None:
@@ -258,10 +260,14 @@ class Looks:
         depth = part.of(torch.from_numpy(self.depth.at(frame)))
         return Depths(depth[None], torch.full((), instant).expand(1, *depth.shape))
 
-    def _sharp(self, times: Times, frame: int, part: Part, belief: Belief) -> Pixels:
-        """Sharp pictures `[1, h, w, k]` at some instants."""
+    def _sharp(
+        self, times: Times, frame: int, part: Part, sensor_estimate: SensorEstimate
+    ) -> Pixels:
+        """Sharp images `[1, h, w, k]` at some instants."""
         assert self.sharp is not None
-        value = torch.stack([part.of(self.sharp.at(int(t), belief)) for t in times], 2)[None]
+        value = torch.stack([part.of(self.sharp.at(int(t), sensor_estimate)) for t in times], 2)[
+            None
+        ]
         time = torch.from_numpy(self.capture.clock.unit(times)).float()
         return self._pixels(value, frame, (time, time), part)
 
@@ -318,7 +324,7 @@ class Looks:
         )
 
 
-def spread_over(
+def stratified_times(
     window_us: tuple[int, int], few: int, draws: int, random: np.random.Generator
 ) -> tuple[Times, Times]:
     """Instants spread evenly over an exposure: `few` that teach, and the rest of `few * draws`."""

@@ -1,7 +1,7 @@
-"""Blurry frames and events from footage of a fast camera: a folder of pictures, or a video.
+"""Blurry frames and events from footage of a fast camera: a folder of images, or a video.
 
-Between two pictures the logarithm of light goes straight, which is only true of fast footage: a
-few hundred pictures per second, or motion of less than about a pixel from one to the next.
+Between two images the logarithm of light goes straight, which is only true of fast footage: a
+few hundred images per second, or motion of less than about a pixel from one to the next.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,29 +22,29 @@ from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor, decode
 from sharpfield.simulation.simulate import Recorder
 
-PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-"""Endings of picture files."""
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+"""Endings of image files."""
 
 
 @dataclass(frozen=True)
 class Footage:
-    """Sharp pictures at known times; they are read as they are needed."""
+    """Sharp images at known times; they are read as they are needed."""
 
     name: str
     times_us: Int64[np.ndarray, "n"]
-    pictures: Callable[[], Iterator[Float32[np.ndarray, "h w 3"]]]
-    """Linear RGB 0...1, from the first picture to the last."""
+    images: Callable[[], Iterator[Float32[np.ndarray, "h w 3"]]]
+    """Linear RGB 0...1, from the first image to the last."""
 
     def __post_init__(self) -> None:
         if len(self.times_us) < 2:
             raise CaptureError(
-                "footage needs two pictures at least", where=self.name, got=len(self.times_us)
+                "footage needs two images at least", where=self.name, got=len(self.times_us)
             )
         back = np.flatnonzero(np.diff(self.times_us) <= 0)
         if len(back):
             raise CaptureError(
-                "times of pictures must ascend",
-                where=f"{self.name}, pictures {back[0]} and {back[0] + 1}",
+                "times of images must ascend",
+                where=f"{self.name}, images {back[0]} and {back[0] + 1}",
                 got=f"{self.times_us[back[0]]} us, then {self.times_us[back[0] + 1]} us",
             )
 
@@ -56,7 +56,7 @@ def folder_footage(
     times_us: Int64[np.ndarray, "n"] | None = None,
     encoding: str = "srgb",
 ) -> Footage:
-    """A folder of pictures, in the order of their names.
+    """A folder of images, in the order of their names.
 
     Args:
         folder: Where they are.
@@ -65,33 +65,33 @@ def folder_footage(
         encoding: How stored values relate to light, see `core.frames.ENCODINGS`.
 
     Raises:
-        CaptureError: There are no pictures, or not one time for each.
+        CaptureError: There are no images, or not one time for each.
         OptionError: Neither, or both, of rate and times are given.
     """
-    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in PICTURES)
+    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in IMAGES)
     if not files:
         raise CaptureError(
-            "no pictures found", where=folder, do=f"put files there that end in {PICTURES}"
+            "no images found", where=folder, do=f"put files there that end in {IMAGES}"
         )
     if (per_second is None) == (times_us is None):
-        raise OptionError("give either the rate of the pictures or their times", where=folder)
+        raise OptionError("give either the rate of the images or their times", where=folder)
     if times_us is None:
         times_us = _even(len(files), per_second)
     if len(times_us) != len(files):
         raise CaptureError(
-            "there must be one time for each picture",
+            "there must be one time for each image",
             where=folder,
-            got=f"{len(files)} pictures, {len(times_us)} times",
+            got=f"{len(files)} images, {len(times_us)} times",
         )
 
-    def pictures() -> Iterator[Float32[np.ndarray, "h w 3"]]:
+    def images() -> Iterator[Float32[np.ndarray, "h w 3"]]:
         for file in files:
             stored = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
             if stored is None:
-                raise CaptureError("a picture cannot be read", where=file)
+                raise CaptureError("a image cannot be read", where=file)
             yield _linear(stored, encoding)
 
-    return Footage(folder.name, times_us, pictures)
+    return Footage(folder.name, times_us, images)
 
 
 def video_footage(
@@ -101,7 +101,7 @@ def video_footage(
 
     Args:
         file: Anything that OpenCV can decode.
-        per_second: How many pictures were *taken* per second, where the file says how many are to
+        per_second: How many images were *taken* per second, where the file says how many are to
             be shown (slow motion).
         encoding: How stored values relate to light.
 
@@ -117,10 +117,10 @@ def video_footage(
         raise CaptureError(
             "not a video that can be decoded",
             where=file,
-            got=f"{count} pictures, {shown} per second",
+            got=f"{count} images, {shown} per second",
         )
 
-    def pictures() -> Iterator[Float32[np.ndarray, "h w 3"]]:
+    def images() -> Iterator[Float32[np.ndarray, "h w 3"]]:
         again = cv2.VideoCapture(str(file))
         try:
             for _ in range(count):
@@ -131,7 +131,7 @@ def video_footage(
         finally:
             again.release()
 
-    return Footage(file.stem, _even(count, per_second or shown), pictures)
+    return Footage(file.stem, _even(count, per_second or shown), images)
 
 
 def simulate_footage(
@@ -146,26 +146,26 @@ def simulate_footage(
     """Blurry frames and events of footage; poses are unknown.
 
     Args:
-        footage: Sharp pictures.
-        group: How many consecutive pictures one exposure spans; 1 for sharp frames.
-        every: Pictures from one exposure's start to the next; `group` unless given.
+        footage: Sharp images.
+        group: How many consecutive images one exposure spans; 1 for sharp frames.
+        every: Images from one exposure's start to the next; `group` unless given.
         frame_sensor: How blurry frames are stored.
         event_sensor: What the event pixels are like; ideal unless given.
         seed: Of the sensors' differences and noise.
 
     Returns:
         A capture whose poses and lens are placeholders, which its notes say; frames have the
-        picture at mid exposure as their truth.
+        image at mid exposure as their truth.
     """
     every, times = every or group, footage.times_us
     first = np.arange(0, len(times) - group + 1, max(every, 1))
     if group < 1 or every < group or not len(first):
         raise OptionError(
-            "pictures cannot be grouped like this",
+            "images cannot be grouped like this",
             where=footage.name,
-            got=f"{len(times)} pictures in groups of {group}, one every {every}",
+            got=f"{len(times)} images in groups of {group}, one every {every}",
         )
-    shown = footage.pictures()
+    shown = footage.images()
     start = next(shown)
     height, width = start.shape[:2]
     recorder = Recorder(
@@ -178,8 +178,8 @@ def simulate_footage(
     for number, (t_us, rgb) in enumerate(zip(times.tolist(), chain([start], shown), strict=True)):
         if rgb.shape[:2] != (height, width):
             raise CaptureError(
-                "pictures have different sizes",
-                where=f"{footage.name}, picture {number}",
+                "images have different sizes",
+                where=f"{footage.name}, image {number}",
                 got=f"{rgb.shape[1]}x{rgb.shape[0]} after {width}x{height}",
             )
         recorder.see(rgb, t_us)
@@ -200,7 +200,7 @@ def simulate_footage(
 
 def _even(count: int, per_second: float | None) -> Int64[np.ndarray, "n"]:
     if per_second is None or not 0 < per_second <= 1e6:
-        raise OptionError("pictures per second must be between 0 and a million", got=per_second)
+        raise OptionError("images per second must be between 0 and a million", got=per_second)
     return np.rint(np.arange(count) * (1e6 / per_second)).astype(np.int64)
 
 

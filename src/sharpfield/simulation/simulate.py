@@ -3,7 +3,7 @@
 Frames follow the published Ev-DeblurNeRF data: one exposure every interval, blurred by the
 camera's motion, but every eighth a sharp view at the middle of its slot, held out for testing.
 
-A frame camera and an event camera that look at the same pictures.
+A frame camera and an event camera that look at the same images.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +31,7 @@ from sharpfield.simulation.sensors.frames import Exposing, FrameSensor, store
 
 
 class Recorder:
-    """Blurry frames, their sharp truth, and events, from pictures shown one after the other."""
+    """Blurry frames, their sharp truth, and events, from images shown one after the other."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Recorder:
         self._sharp.see(rgb, t_us)
 
     def frames(self) -> Frames:
-        """All frames, each with the sharp picture at the middle of its exposure as its truth."""
+        """All frames, each with the sharp image at the middle of its exposure as its truth."""
         count, draw = len(self._exposure), numpy_generator(self._seed, 0, "frame noise")
         return Frames(
             images=store(self._blurry.means(), self._frame_sensor, draw),
@@ -83,7 +83,7 @@ class Recorder:
 P = TypeVar("P")
 
 AHEAD = 32
-"""Pictures drawn ahead by all cores; bounds memory."""
+"""Images drawn ahead by all cores; bounds memory."""
 MARGIN_US = 10_000
 """The camera is watched for this long before the first exposure and after the last."""
 FOCAL_OF_WIDTH = 0.92
@@ -100,9 +100,9 @@ class Timing:
     interval_us: int = 56_000
     """From one exposure's start to the next."""
     step_us: int = 1000
-    """Between two pictures of the scene: 1000 for a camera of 1000 pictures per second."""
+    """Between two images of the scene: 1000 for a camera of 1000 images per second."""
     most_change: float = 0.0
-    """Largest change of log intensity between two pictures, which are placed closer where it is
+    """Largest change of log intensity between two images, which are placed closer where it is
     exceeded; 0 for even steps."""
     test_every: int = 8
     """Every how many frames one is sharp and held out, the first included; 0 for none."""
@@ -226,7 +226,7 @@ def record(
         event_sensor=rig.event_sensor,
         seed=seed,
     )
-    for t_us, rgb in pictures(place, path, rig.camera(), timing):
+    for t_us, rgb in images(place, path, rig.camera(), timing):
         recorder.see(rgb, t_us)
     return recorder
 
@@ -248,10 +248,10 @@ def view(
     return rgb.reshape(*shape, 3), depth.reshape(shape)
 
 
-def pictures(
+def images(
     place: Scene, path: CameraPath, camera: Camera, timing: Timing
 ) -> Iterator[tuple[int, Float32[np.ndarray, "h w 3"]]]:
-    """Times in us and linear pictures over a whole recording, in the order of time."""
+    """Times in us and linear images over a whole recording, in the order of time."""
     count = -(-timing.span_us() // timing.step_us)
     instants = np.minimum(np.arange(count + 1) * timing.step_us, timing.span_us())
 
@@ -266,7 +266,7 @@ def pictures(
 
 
 def drawn_ahead(draw: Callable[[int], P], times_us: Sequence[int]) -> Iterator[P]:
-    """Pictures at some times, in their order, drawn by all cores."""
+    """Images at some times, in their order, drawn by all cores."""
     with ThreadPoolExecutor(cpu_count()) as pool:
         for first in range(0, len(times_us), AHEAD):
             yield from pool.map(draw, times_us[first : first + AHEAD])

@@ -18,7 +18,7 @@ from sharpfield.core.protocols import Trajectory
 from sharpfield.core.seed import number
 from sharpfield.geometry.trajectory import Still, Tracks
 from sharpfield.simulation.cameras.motion import CameraPath, stamped
-from sharpfield.simulation.cameras.rigs import RING_FOCAL, Standing, Views, ring
+from sharpfield.simulation.cameras.rigs import RING_FOCAL, StillCamera, Views, ring
 from sharpfield.simulation.scenes.flow import depth_and_flow
 from sharpfield.simulation.scenes.moving import moving_scene
 from sharpfield.simulation.scenes.static import Scene
@@ -99,7 +99,7 @@ def simulate_moving(
 def _in_order_of_tracks(views: Views) -> list[tuple[CameraPath, bool]]:
     """Each camera and whether it is held out; those that move first."""
     every = [(path, False) for path in views.learned] + [(path, True) for path in views.held_out]
-    return sorted(every, key=lambda camera: isinstance(camera[0], Standing))
+    return sorted(every, key=lambda camera: isinstance(camera[0], StillCamera))
 
 
 def _record(
@@ -144,8 +144,8 @@ def _stream(tracks: Sequence[_Track], chosen: np.ndarray) -> EventStream:
 
 
 def _trajectory(paths: Sequence[CameraPath], clock: Clock) -> Trajectory:
-    still = np.array([path.pose for path in paths if isinstance(path, Standing)])
-    moving = [stamped(path, clock) for path in paths if not isinstance(path, Standing)]
+    still = np.array([path.pose for path in paths if isinstance(path, StillCamera)])
+    moving = [stamped(path, clock) for path in paths if not isinstance(path, StillCamera)]
     return Tracks(moving, still.reshape(-1, 3, 4)) if moving else Still(still)
 
 

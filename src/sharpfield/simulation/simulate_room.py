@@ -2,7 +2,7 @@
 
 Frames are taken evenly; the shutter is open for the same time in each, as long as it takes for a
 wanted share of them to be blurred. Which ones are sharp is up to the walk: those of its pauses. All
-else is known: the sharp picture and the depth in the middle of each exposure, the pose at any time,
+else is known: the sharp image and the depth in the middle of each exposure, the pose at any time,
 and the true blur of every frame (`notes["blur_px"]`, see `simulation.travel`). Held-out frames are
 instants, and therefore sharp.
 """
@@ -34,10 +34,10 @@ BLURRY_OF_WIDTH = 0.006
 """A frame counts as blurry when its points travel this share of the image's width: 1.4 px of 240,
 3.8 px of 640."""
 STRIDE_PX = 0.8
-"""How far points may travel between two of the pictures that make up a blurred frame."""
-MOST_PICTURES = 64
+"""How far points may travel between two of the images that make up a blurred frame."""
+MOST_IMAGES = 64
 PROBE_PX = 24
-"""Width of the pictures in which travel is measured."""
+"""Width of the images in which travel is measured."""
 OPEN_OF_INTERVAL = 0.9
 """Longest exposure over the interval between two."""
 FARTHEST_M = 65.0
@@ -59,7 +59,7 @@ class RoomTiming:
     blurry: float = 0.75
     """Share of the frames learned from that is blurred."""
     blur: Blur = "motion"
-    """By the walk while the shutter is open; or as published, each picture by one random kernel."""
+    """By the walk while the shutter is open; or as published, each image by one random kernel."""
     exposure_us: int | None = None
     """By default as long as it takes for that share."""
     test_every: int = 8
@@ -69,7 +69,7 @@ class RoomTiming:
     events: bool = False
     """Whether an event camera watches, too; takes several times longer."""
     step_us: int = 4000
-    """Between two of the pictures it watches."""
+    """Between two of the images it watches."""
 
     def __post_init__(self) -> None:
         if self.frames < 2 or self.interval_us < 1000 or self.step_us < 1:
@@ -139,7 +139,7 @@ def simulate_room(
     probe = _Probe(place, camera, path, timing.middle_us())
     exposure = _exposure(probe, camera, timing)
     recorded = _Recorded(exposure, rig, seed, events=timing.events)
-    for t_us, rgb, depth in _pictures(place, camera, path, _times(probe, exposure, timing)):
+    for t_us, rgb, depth in _images(place, camera, path, _times(probe, exposure, timing)):
         recorded.see(t_us, rgb, depth)
     frames, events = recorded.frames(), recorded.events()
     blur = np.array([probe.travel(i, exposure.window(i)).mean() for i in range(len(exposure))])
@@ -172,7 +172,7 @@ def _stored(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
 
 
 class _Probe:
-    """How points travel during each frame, from small pictures."""
+    """How points travel during each frame, from small images."""
 
     def __init__(
         self, place: Scene, camera: Camera, path: CameraPath, middle_us: Int64[np.ndarray, "n"]
@@ -214,25 +214,25 @@ def _exposure(probe: _Probe, camera: Camera, timing: RoomTiming) -> Exposure:
 
 
 def _times(probe: _Probe, exposure: Exposure, timing: RoomTiming) -> Int64[np.ndarray, "k"]:
-    """When to draw a picture: often enough during exposures, and evenly for events."""
+    """When to draw a image: often enough during exposures, and evenly for events."""
     times = []
     for i in range(len(exposure)):
         far = float(np.quantile(probe.travel(i, exposure.window(i)), 0.95))
-        pictures = min(int(np.ceil(far / STRIDE_PX)) + 1, MOST_PICTURES)
-        times.append(instants(exposure, i, pictures=pictures))
+        images = min(int(np.ceil(far / STRIDE_PX)) + 1, MOST_IMAGES)
+        times.append(instants(exposure, i, images=images))
     if timing.events:
         times.append(np.arange(0, timing.span_us() + 1, timing.step_us))
     return np.unique(np.concatenate(times))
 
 
-Picture = tuple[int, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]
+Image = tuple[int, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]
 """Time, linear light and depth."""
 
 
-def _pictures(
+def _images(
     place: Scene, camera: Camera, path: CameraPath, times_us: Int64[np.ndarray, "k"]
-) -> Iterator[Picture]:
-    def draw(t_us: int) -> Picture:
+) -> Iterator[Image]:
+    def draw(t_us: int) -> Image:
         return t_us, *view(place, camera, path.poses(np.array([t_us]))[0])
 
     yield from drawn_ahead(draw, times_us.tolist())
@@ -255,7 +255,7 @@ class _Recorded:
     def see(
         self, t_us: int, rgb: Float32[np.ndarray, "h w 3"], depth: Float32[np.ndarray, "h w"]
     ) -> None:
-        """A picture, after all earlier ones."""
+        """A image, after all earlier ones."""
         if self._pixels is not None:
             self._gaps.append(self._pixels.see(rgb, 1000 * t_us))
         i = self._frame
@@ -275,7 +275,7 @@ class _Recorded:
             self._open, self._frame = None, i + 1
 
     def frames(self) -> Frames:
-        """All frames, each with the sharp picture in the middle of its exposure as its truth."""
+        """All frames, each with the sharp image in the middle of its exposure as its truth."""
         count = len(self._exposure)
         return Frames(
             images=np.stack(self._images),

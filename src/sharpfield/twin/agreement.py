@@ -24,10 +24,10 @@ from sharpfield.report.colormaps import colour_signs
 from sharpfield.report.event_frames import busy, count_events, signed
 
 MOST_COUNT = 20
-"""Larger counts of a pixel and window are cut to this before they are compared as pictures."""
+"""Larger counts of a pixel and window are cut to this before they are compared as images."""
 
 GAP_PX = 4
-"""Between pictures side by side."""
+"""Between images side by side."""
 
 
 @dataclass(frozen=True)

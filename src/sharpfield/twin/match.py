@@ -29,9 +29,9 @@ from sharpfield.twin.twin import (
     PACE,
     Pace,
     Viewpoint,
+    images,
     light_of,
     on_track,
-    pictures,
     recorded_sensor,
 )
 
@@ -45,8 +45,8 @@ fall, for weak edges come in."""
 FARTHEST = 4.0
 """Most that a threshold is changed by, either way."""
 
-Looks = list[tuple[int, Float32[np.ndarray, "h w"]]]
-"""Pictures of a lead and its window."""
+ViewSampler = list[tuple[int, Float32[np.ndarray, "h w"]]]
+"""Images of a lead and its window."""
 
 
 @dataclass(frozen=True)
@@ -117,11 +117,11 @@ def match(
     stream = capture.events
     if stream is None or not len(stream):
         raise OptionError("the capture has no events to match thresholds to", where=capture.name)
-    seen: list[tuple[int, Looks]] = []
+    seen: list[tuple[int, ViewSampler]] = []
     recorded = np.zeros(2, np.int64)
     for seat, start_us in _places(model, capture, stream, matching, away_from):
         draw = light_of(model, seat, subpixels=subpixels)
-        seen.append((start_us, list(pictures(draw, seat.span_us, sensor, pace))))
+        seen.append((start_us, list(images(draw, seat.span_us, sensor, pace))))
         recorded += _signs(stream.of_track(seat.track).window(start_us, seat.span_us[1]).p)
     if not recorded.all():
         raise OptionError(
@@ -177,7 +177,7 @@ def _start_us(
 
 
 def _fit(
-    seen: list[tuple[int, Looks]], sensor: EventSensor, recorded: Int64[np.ndarray, "2"]
+    seen: list[tuple[int, ViewSampler]], sensor: EventSensor, recorded: Int64[np.ndarray, "2"]
 ) -> tuple[Float64[np.ndarray, "2"], int]:
     """Factors on both thresholds, darker first; and the number of events without them."""
     factor, unmatched = np.ones(2), 0
@@ -202,7 +202,7 @@ def _fit(
     return factor, unmatched
 
 
-def _count(looks: Looks, start_us: int, sensor: EventSensor) -> Int64[np.ndarray, "2"]:
+def _count(looks: ViewSampler, start_us: int, sensor: EventSensor) -> Int64[np.ndarray, "2"]:
     """Events to darker and to brighter since the start of a window."""
     pixels, counts = EventPixels(sensor, 0), np.zeros(2, np.int64)
     for t_us, light in looks:

@@ -136,7 +136,7 @@ def compare(
     edges_us: list[int],
     about: dict[str, Any],
 ) -> None:
-    """Print how two streams agree; write it, and a picture of them, beside the events.
+    """Print how two streams agree; write it, and a image of them, beside the events.
 
     Args:
         console: Where to print.
@@ -149,19 +149,19 @@ def compare(
         name: value if math.isfinite(value) else None
         for name, value in asdict(agreement(*streams, edges_us)).items()
     }
-    table, picture = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
+    table, image = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
     with replacing(table) as temporary:
         temporary.write_text(json.dumps(found | about, indent=2, allow_nan=False) + "\n")
-    write_image(picture, side_by_side(*streams, edges_us))
+    write_image(image, side_by_side(*streams, edges_us))
     for name, value in found.items():
         shown = "-" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
         console.print(f"  {name:<18} {shown}")
-    console.print(f"Recorded and rendered side by side: {picture}")
+    console.print(f"Recorded and rendered side by side: {image}")
 
 
 @contextmanager
 def telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, Tell]]:
-    """Progress through time, and within a picture: what to tell of either."""
+    """Progress through time, and within a image: what to tell of either."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -173,7 +173,7 @@ def telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, 
         task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
 
         def look(done: int, pixels: int) -> None:
-            progress.update(task, description=f"picture {done / pixels:4.0%}")
+            progress.update(task, description=f"image {done / pixels:4.0%}")
 
         def tell(t_us: int) -> None:
             progress.update(task, completed=(t_us - span_us[0]) / 1000)

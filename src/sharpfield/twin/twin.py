@@ -11,7 +11,7 @@ A pixel compares with the level of its own last event, however long ago: what `u
 windows is, event by event, what it tells in one.
 
 A pixel gathers light over its whole area. Gaussians are drawn so much wider than they are; rays see
-a point. `subpixels` takes means over a larger picture instead.
+a point. `subpixels` takes means over a larger image instead.
 
 Source: ESIM (Rebecq et al., CoRL 2018) for events from rendered light; EvDNeRF (WACV 2024) for
 rendering it from a learned scene, there as the change between two instants only.
@@ -89,9 +89,9 @@ class EventTwin:
     ) -> None:
         self.sensor, self.span_us = sensor, span_us
         self._pixels = EventPixels(sensor, seed)
-        self._pictures = pictures(draw, span_us, sensor, pace)
+        self._images = images(draw, span_us, sensor, pace)
         self.looks = 0
-        """Pictures seen."""
+        """Images seen."""
         self._last_us = span_us[0] - 1
         self._size = (0, 0)
         self._held: list[Gap] = []
@@ -104,7 +104,7 @@ class EventTwin:
                 events on the end itself, which then count.
         """
         while self._last_us < min(t_us, self.span_us[1]):
-            self._last_us, light = next(self._pictures)
+            self._last_us, light = next(self._images)
             self._size = light.shape[1], light.shape[0]
             self._held.append(self._pixels.see(light, 1000 * self._last_us))
             self.looks += 1
@@ -115,7 +115,7 @@ class EventTwin:
         return found[:told]
 
 
-def pictures(
+def images(
     draw: Draw, span_us: tuple[int, int], sensor: EventSensor, pace: Pace
 ) -> Iterator[tuple[int, Float32[np.ndarray, "h w"]]]:
     """Times in us, and what falls on each pixel then, from the start of a span to its end.
@@ -229,8 +229,8 @@ def light_of(
     Args:
         model: Trained; of rays or of whole views.
         seat: Where to look from.
-        subpixels: How many times wider and higher the picture is whose means are taken.
-        progress: Told how much of a picture is done.
+        subpixels: How many times wider and higher the image is whose means are taken.
+        progress: Told how much of a image is done.
 
     Raises:
         OptionError: The model cannot be seen through this camera, or there are no subpixels.

@@ -69,7 +69,7 @@ def test_other_views_are_held_out(folder: Path) -> None:
     np.testing.assert_allclose(found.frame_pose(np.array([0]))[0], pose(9)[:3], atol=1e-6)
 
 
-def test_pictures_along_the_path_are_on_it(folder: Path) -> None:
+def test_images_along_the_path_are_on_it(folder: Path) -> None:
     for i in range(POSES):
         image = np.full((HEIGHT, WIDTH, 3), i, np.uint8)
         write_image(folder / "train" / "rgb" / f"r_{i:05d}.png", image)
@@ -77,7 +77,7 @@ def test_pictures_along_the_path_are_on_it(folder: Path) -> None:
     np.testing.assert_array_equal(found.split.train, np.arange(5))
     np.testing.assert_allclose(found.frame_pose(np.array([3]))[0], pose(3)[:3], atol=1e-6)
     (folder / "train" / "rgb" / "r_00000.png").unlink()
-    with pytest.raises(CaptureError, match="a pose for each train picture"):
+    with pytest.raises(CaptureError, match="a pose for each train image"):
         read(folder, event_unit="s")
 
 

@@ -319,7 +319,7 @@ def test_images_of_different_sizes(blender):
 
 def test_an_unreadable_image(blender):
     folder, _, _ = blender
-    (folder / "images_1" / "03.png").write_bytes(b"not a picture")
+    (folder / "images_1" / "03.png").write_bytes(b"not a image")
     fails(folder, "cannot decode image", "03.png")
 
 
@@ -433,7 +433,7 @@ def test_truth_of_another_size(blender):
     fails(folder, "sharp image differs from the frame", "truth.npz, 03")
 
 
-# A capture rendered at 1000 pictures per second
+# A capture rendered at 1000 images per second
 
 
 def test_atelier(samples):

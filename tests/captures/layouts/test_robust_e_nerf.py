@@ -85,7 +85,7 @@ def test_a_scene(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_pictures_to_be_predicted(folder: Path, beside: bool) -> None:
+def test_images_to_be_predicted(folder: Path, beside: bool) -> None:
     views(folder.parent if beside else folder)
     found = read(folder)
     assert found.split.test.tolist() == [0] and len(found.split.train) == 0
@@ -94,7 +94,7 @@ def test_pictures_to_be_predicted(folder: Path, beside: bool) -> None:
     np.testing.assert_allclose(found.frame_pose(np.array([0]))[0], expected, atol=1e-6)
 
 
-def test_pictures_of_another_camera_are_left_out(folder: Path) -> None:
+def test_images_of_another_camera_are_left_out(folder: Path) -> None:
     views(folder, (HEIGHT, WIDTH + 1))
     found = read(folder)
     assert found.frames is None and "another size" in found.notes["views"]

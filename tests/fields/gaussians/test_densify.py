@@ -3,7 +3,7 @@ import torch
 
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.seed import generator
-from sharpfield.fields.gaussians.densify import DEAD, Watch, densify, fade
+from sharpfield.fields.gaussians.densify import DEAD, GradientStats, densify, fade
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.training.surgery import rebuild
 
@@ -24,8 +24,8 @@ def scene(scales: list[float], opacities: list[float] | None = None) -> Gaussian
     return made
 
 
-def densified(made: Gaussians, wish: list[float], *, budget: int = 99):
-    return densify(made, torch.tensor(wish), 1.0, budget=budget, generator=chance())
+def densified(made: Gaussians, mean_grad: list[float], *, budget: int = 99):
+    return densify(made, torch.tensor(mean_grad), 1.0, budget=budget, generator=chance())
 
 
 def test_small_ones_are_cloned():
@@ -77,7 +77,7 @@ def test_content_gaussians_stay_as_they_are():
 
 
 def test_a_watch_averages_over_the_views_that_saw_a_splat():
-    watch = Watch(3)
+    watch = GradientStats(3)
     pull = torch.zeros(2, 3, 2)
     pull[0, 0], pull[1, 0], pull[1, 1] = (
         torch.tensor([0.03, 0.04]),
@@ -85,13 +85,13 @@ def test_a_watch_averages_over_the_views_that_saw_a_splat():
         torch.tensor([0.3, 0.4]),
     )
     watch.note(pull, (200, 200))
-    torch.testing.assert_close(watch.wish, torch.tensor([7.5, 50.0, 0.0]))
+    torch.testing.assert_close(watch.mean_grad, torch.tensor([7.5, 50.0, 0.0]))
     watch.note(pull[:1] * 3, (200, 200))
-    torch.testing.assert_close(watch.wish, torch.tensor([10.0, 50.0, 0.0]))
+    torch.testing.assert_close(watch.mean_grad, torch.tensor([10.0, 50.0, 0.0]))
 
 
 def test_a_watch_begins_anew_when_gaussians_grow():
-    made, watch = scene([SMALL, SMALL]), Watch(2)
+    made, watch = scene([SMALL, SMALL]), GradientStats(2)
     assert isinstance(watch, PointSet)
     watch.note(torch.ones(1, 2, 2), (2, 2))
     growth = densified(made, [1.0, 1.0])
@@ -99,10 +99,10 @@ def test_a_watch_begins_anew_when_gaussians_grow():
     optimizer = torch.optim.Adam(made.parameters())
     rebuild(made, optimizer, growth)
     rebuild(watch, optimizer, watch.anew(growth))
-    assert len(made) == len(watch.wish) == 4 and not watch.wish.any()
+    assert len(made) == len(watch.mean_grad) == 4 and not watch.mean_grad.any()
     assert set(watch.state_dict()) == {"total", "times"}
     watch.note(torch.ones(1, 4, 2), (2, 2))
-    torch.testing.assert_close(watch.wish, torch.full((4,), 2**0.5))
+    torch.testing.assert_close(watch.mean_grad, torch.full((4,), 2**0.5))
 
 
 def test_fading_leaves_the_faint_alone_and_their_moments():

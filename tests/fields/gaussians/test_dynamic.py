@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from sharpfield.fields.gaussians.dynamic import FADED, MovingGaussians, Together, half_turn, product
+from sharpfield.fields.gaussians.dynamic import (
+    FADED,
+    GaussianUnion,
+    MovingGaussians,
+    half_turn,
+    product,
+)
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry.se3 import rotation_exp, rotation_from_quaternion
 
@@ -82,7 +88,7 @@ def test_for_most_of_its_span_each_stays_as_opaque():
 def test_still_and_moving_ones_are_drawn_together():
     moving = some()
     base = Gaussians.start(torch.zeros(2, 3), torch.zeros(2, 3), torch.full((2,), 0.5), degree=1)
-    both = Together(base, moving.at(0.5))
+    both = GaussianUnion(base, moving.at(0.5))
     assert both.means.shape == both.scales.shape == (7, 3)
     assert both.quaternions.shape == (7, 4) and both.opacities.shape == (7,)
     torch.testing.assert_close(

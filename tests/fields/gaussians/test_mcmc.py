@@ -5,7 +5,13 @@ import torch
 
 from sharpfield.core.points import Growth
 from sharpfield.core.seed import generator
-from sharpfield.fields.gaussians.mcmc import DEAD, idleness, share_out, shared, wander
+from sharpfield.fields.gaussians.mcmc import (
+    DEAD,
+    opacity_scale_penalty,
+    position_noise,
+    relocate_and_add,
+    shared,
+)
 from sharpfield.fields.gaussians.static import Gaussians
 
 
@@ -23,7 +29,7 @@ def crowd(count: int = 40, *, dead: int = 10) -> tuple[torch.Tensor, torch.Tenso
 
 def grown(budget: int = 40, **options) -> tuple[Growth, torch.Tensor, torch.Tensor]:
     scales, logits = crowd(**options)
-    growth = share_out(scales, logits, budget=budget, generator=chance())
+    growth = relocate_and_add(scales, logits, budget=budget, generator=chance())
     assert growth is not None
     return growth, scales, logits
 
@@ -84,13 +90,17 @@ def test_it_grows_by_a_twentieth_up_to_the_budget():
     assert len(growth) == 42 and growth.fresh.tolist() == [False] * 40 + [True] * 2
     growth, *_ = grown(budget=41, count=40, dead=0)
     assert len(growth) == 41
-    assert share_out(*crowd(dead=0), budget=40, generator=chance()) is None
-    assert share_out(*crowd(dead=0), budget=7, generator=chance()) is None  # none are taken away
+    assert relocate_and_add(*crowd(dead=0), budget=40, generator=chance()) is None
+    assert (
+        relocate_and_add(*crowd(dead=0), budget=7, generator=chance()) is None
+    )  # none are taken away
 
 
 def test_the_opaque_are_chosen_more_often():
     logits = torch.tensor([0.1, 0.3, 0.6, 0.001]).logit().repeat(500)
-    growth = share_out(torch.zeros(2000, 3), logits, budget=9999, generator=chance(), more=4.0)
+    growth = relocate_and_add(
+        torch.zeros(2000, 3), logits, budget=9999, generator=chance(), more=4.0
+    )
     assert growth is not None
     kind = growth.source[growth.fresh] % 4
     share = torch.bincount(kind, minlength=4) / len(kind)
@@ -98,14 +108,14 @@ def test_the_opaque_are_chosen_more_often():
 
 
 def test_without_anyone_alive_nothing_moves():
-    assert share_out(*crowd(dead=40), budget=99, generator=chance()) is None
+    assert relocate_and_add(*crowd(dead=40), budget=99, generator=chance()) is None
     none = torch.zeros(0)
-    assert share_out(none.reshape(0, 3), none, budget=99, generator=chance()) is None
+    assert relocate_and_add(none.reshape(0, 3), none, budget=99, generator=chance()) is None
 
 
 def test_it_depends_on_its_generator_alone():
-    first, again = (share_out(*crowd(), budget=99, generator=chance()) for _ in range(2))
-    other = share_out(*crowd(), budget=99, generator=chance(1))
+    first, again = (relocate_and_add(*crowd(), budget=99, generator=chance()) for _ in range(2))
+    other = relocate_and_add(*crowd(), budget=99, generator=chance(1))
     assert first is not None and again is not None and other is not None
     assert torch.equal(first.source, again.source) and not torch.equal(first.source, other.source)
 
@@ -120,19 +130,19 @@ def scene(opacity: float, count: int = 4000) -> Gaussians:
 
 
 def test_noise_has_the_square_of_the_gaussians_shape():
-    noise = wander(scene(DEAD), 1e-3, chance(), noise=100.0)
+    noise = position_noise(scene(DEAD), 1e-3, chance(), noise=100.0)
     wanted = 0.5 * 0.1 * torch.tensor([0.1, 0.3, 0.02]) ** 2  # half open at the threshold itself
     torch.testing.assert_close(noise.std(0), wanted, rtol=0.05, atol=0)
 
 
 def test_the_opaque_do_not_wander():
-    assert wander(scene(0.5), 1e-3, chance()).abs().max() < 1e-15
-    assert wander(scene(1e-4), 1e-3, chance()).std() > 0.1
+    assert position_noise(scene(0.5), 1e-3, chance()).abs().max() < 1e-15
+    assert position_noise(scene(1e-4), 1e-3, chance()).std() > 0.1
 
 
 def test_idleness():
     made = scene(0.25)
-    opacity, scale = idleness(made)
+    opacity, scale = opacity_scale_penalty(made)
     assert opacity.item() == pytest.approx(0.25) and scale.item() == pytest.approx(0.42 / 3)
     (opacity + scale).backward()
     assert made.log_scales.grad is not None and (made.log_scales.grad > 0).all()

@@ -23,7 +23,7 @@ def activity(seed: int, *, steady: bool = False) -> np.ndarray:
 
 
 def seen(per_ms: np.ndarray, lag_us: int, *, noise: float) -> tuple[np.ndarray, np.ndarray]:
-    """Middles of exposures on a clock that is late by a lag, and how much pictures changed."""
+    """Middles of exposures on a clock that is late by a lag, and how much images changed."""
     true_us = 300_000 + np.arange(FRAMES, dtype=np.int64) * INTERVAL_US
     until = np.concatenate([[0], np.cumsum(per_ms)])
     change = np.diff(np.interp(true_us / 1000, np.arange(len(until)), until))

@@ -16,10 +16,10 @@ from sharpfield.core.events import EventStream
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.ingest.ingest import Ingested, ingest
 from sharpfield.preparation.ingest.lens import Optics
-from sharpfield.preparation.ingest.options import Choices, Cleaning, Crop, Scene, Timing
+from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
 from sharpfield.preparation.ingest.stage import Stage
 from sharpfield.recordings.aedat.aedat4_writer import write_aedat4
-from sharpfield.recordings.open import Told, open_recording
+from sharpfield.recordings.open import ReaderOptions, open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers
 from sharpfield.recordings.ros.ros1_writer import write_ros1_bag
 from sharpfield.simulation.sensors.event_pixels import EventSensor
@@ -29,7 +29,7 @@ from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
 
 SIZE = (32, 24)
-SAME = Choices(timing=Timing(clock="same"), scene=Scene(encoding="gamma2.2"))
+SAME = IngestOptions(timing=Timing(clock="same"), scene=Scene(encoding="gamma2.2"))
 
 
 def hush(doing: str, done: int, total: int | None) -> None:
@@ -47,7 +47,7 @@ def truth() -> Capture:
     )
 
 
-def write_pictures(truth: Capture, folder: Path) -> Path:
+def write_images(truth: Capture, folder: Path) -> Path:
     frames = truth.needed_frames
     for i in range(len(frames)):
         write_image(folder / "images" / f"{i:06d}.png", frames.images[i])
@@ -101,28 +101,28 @@ def export(path: Path, events: EventStream) -> None:
         append(events)
 
 
-CONTAINERS: dict[str, tuple[Callable[[Path, EventStream], None], Told]] = {
-    "events.h5": (export, Told()),
-    "events.npz": (export, Told()),
-    "events.csv": (export, Told(size=SIZE)),
-    "events.raw": (export, Told()),
-    "dsec.h5": (write_dsec, Told(size=SIZE)),
-    "mvsec.h5": (write_mvsec, Told(size=SIZE)),
-    "vid2e": (write_vid2e, Told(size=SIZE)),
-    "dv.aedat4": (write_dv, Told()),
-    "ros.bag": (write_bag, Told()),
-    "rpg": (write_rpg, Told(size=SIZE)),
+CONTAINERS: dict[str, tuple[Callable[[Path, EventStream], None], ReaderOptions]] = {
+    "events.h5": (export, ReaderOptions()),
+    "events.npz": (export, ReaderOptions()),
+    "events.csv": (export, ReaderOptions(size=SIZE)),
+    "events.raw": (export, ReaderOptions()),
+    "dsec.h5": (write_dsec, ReaderOptions(size=SIZE)),
+    "mvsec.h5": (write_mvsec, ReaderOptions(size=SIZE)),
+    "vid2e": (write_vid2e, ReaderOptions(size=SIZE)),
+    "dv.aedat4": (write_dv, ReaderOptions()),
+    "ros.bag": (write_bag, ReaderOptions()),
+    "rpg": (write_rpg, ReaderOptions(size=SIZE)),
 }
 
 
 def ingested(
-    truth: Capture, folder: Path, choices: Choices = SAME, container: str = "events.h5"
+    truth: Capture, folder: Path, choices: IngestOptions = SAME, container: str = "events.h5"
 ) -> tuple[Ingested, Path]:
     write, told = CONTAINERS[container]
     write(folder / container, truth.needed_events)
     recordings = (
         open_recording(folder / container, told),
-        open_recording(write_pictures(truth, folder)),
+        open_recording(write_images(truth, folder)),
     )
     return ingest(recordings, folder / "capture", choices, hush), folder / "capture"
 
@@ -319,7 +319,7 @@ def test_triggers_say_when_frames_were_exposed(truth, tmp_path):
     edges = np.stack([exposure.open_us, exposure.close_us], -1).ravel()
     triggers = Triggers(edges, np.tile(np.array([1, -1], np.int8), 8), np.zeros(16, np.uint8))
     late = [replace(frame, close_us=frame.open_us) for frame in in_memory(truth, 123_456)]
-    choices = Choices(scene=SAME.scene)
+    choices = IngestOptions(scene=SAME.scene)
     out = tmp_path / "capture"
     made = ingest(of_arrays(truth.needed_events, late, triggers), out, choices, hush)
     found = native.read_unposed(out).needed_frames.exposure
@@ -331,7 +331,7 @@ def test_triggers_say_when_frames_were_exposed(truth, tmp_path):
 
 
 def test_an_offset_that_is_given_is_taken(truth, tmp_path):
-    choices = Choices(timing=Timing(offset_ms=-50.0), scene=SAME.scene)
+    choices = IngestOptions(timing=Timing(offset_ms=-50.0), scene=SAME.scene)
     frames = in_memory(truth, 50_000)
     ingest(of_arrays(truth.needed_events, frames), tmp_path / "capture", choices, hush)
     found = native.read_unposed(tmp_path / "capture").needed_frames.exposure
@@ -340,7 +340,9 @@ def test_an_offset_that_is_given_is_taken(truth, tmp_path):
 
 def test_an_offset_that_nobody_can_tell_is_asked_for(truth, tmp_path):
     with pytest.raises(CaptureError) as caught:
-        ingest(of_arrays(truth.needed_events, in_memory(truth)), tmp_path / "c", Choices(), hush)
+        ingest(
+            of_arrays(truth.needed_events, in_memory(truth)), tmp_path / "c", IngestOptions(), hush
+        )
     assert "--offset-ms" in str(caught.value) or "give the offset" in str(caught.value)
 
 
@@ -350,7 +352,7 @@ def test_an_offset_that_nobody_can_tell_is_asked_for(truth, tmp_path):
 def test_two_that_both_have_events_are_refused(truth, tmp_path):
     events, _ = of_arrays(truth.needed_events, [])
     with pytest.raises(OptionError, match="one must give the events and the other the frames"):
-        ingest((events, events), tmp_path / "c", Choices(), hush)
+        ingest((events, events), tmp_path / "c", IngestOptions(), hush)
 
 
 def test_frames_of_another_size_are_a_question(truth, tmp_path):

@@ -9,14 +9,14 @@ import pytest
 
 from sharpfield.captures.native import layout as native
 from sharpfield.core.events import EventStream
-from sharpfield.preparation.ingest.options import Mistakes, mended
+from sharpfield.preparation.ingest.options import AxisFixes, fixed_axes
 from sharpfield.recordings.recording import Recording
 from tests.cli.command import run
 from tests.recordings.captured import expect_equal_events
 from tests.streams import HEIGHT, WIDTH, random_events
 
 
-def spoiled(events: EventStream, mistakes: Mistakes) -> EventStream:
+def spoiled(events: EventStream, mistakes: AxisFixes) -> EventStream:
     """What a program with these mistakes would have written."""
     x, y, width, height = events.x, events.y, events.width, events.height
     x = width - 1 - x if mistakes.flip_x else x
@@ -34,26 +34,26 @@ def spoiled(events: EventStream, mistakes: Mistakes) -> EventStream:
     )
 
 
-ALL = [Mistakes(*parts) for parts in product((False, True), repeat=4)]
+ALL = [AxisFixes(*parts) for parts in product((False, True), repeat=4)]
 
 
 @pytest.mark.parametrize("mistakes", ALL, ids=str)
-def test_each_mixture_of_mistakes_is_undone(mistakes: Mistakes) -> None:
+def test_each_mixture_of_mistakes_is_undone(mistakes: AxisFixes) -> None:
     true = random_events(500)
     wrong = spoiled(true, mistakes)
     size = (wrong.width, wrong.height)
     recording = Recording(
         Path("x"), "made up", size, events=lambda: iter([wrong[:200], wrong[200:]])
     )
-    found = mended(recording, mistakes)
+    found = fixed_axes(recording, mistakes)
     assert found.size == (WIDTH, HEIGHT)
     expect_equal_events(found.load(), true)
-    assert (found.layout == "made up") == (mistakes == Mistakes())
+    assert (found.layout == "made up") == (mistakes == AxisFixes())
 
 
 def test_options_of_ingest_undo_mistakes_of_a_text(tmp_path: Path) -> None:
     true = random_events(500)
-    mistakes = Mistakes(swap_xy=True, flip_y=True, flip_polarity=True)
+    mistakes = AxisFixes(swap_xy=True, flip_y=True, flip_polarity=True)
     wrong = spoiled(true, mistakes)
     table = np.column_stack([wrong.t_us, wrong.x, wrong.y, wrong.p > 0])
     np.savetxt(tmp_path / "events.txt", table, "%d")

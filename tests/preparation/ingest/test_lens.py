@@ -44,7 +44,7 @@ def kalibr(tmp_path) -> Path:
     return tmp_path / "camchain.yaml"
 
 
-def picture(width: int, height: int) -> np.ndarray:
+def image(width: int, height: int) -> np.ndarray:
     y, x = np.mgrid[:height, :width] / height
     return np.rint(120 + 60 * np.sin(3 * x) + 50 * y).astype(np.uint8)
 
@@ -53,7 +53,7 @@ def test_without_a_calibration_the_lens_is_unknown():
     found = geometry(SIZE, SIZE, Optics(), "cam.raw")
     assert found.camera.fx_px == WIDTH
     assert found.notes == {"intrinsics": "unknown"}
-    np.testing.assert_array_equal(found.picture(picture(*SIZE), "")[..., 0], picture(*SIZE))
+    np.testing.assert_array_equal(found.image(image(*SIZE), "")[..., 0], image(*SIZE))
 
 
 def test_a_lens_is_told_and_nothing_is_resampled(radtan):
@@ -62,7 +62,7 @@ def test_a_lens_is_told_and_nothing_is_resampled(radtan):
     assert found.camera.cx_px == 5.9, "pixels count from the corner here"
     events = random_events(100)
     assert found.placed(events, "").x is events.x
-    np.testing.assert_array_equal(found.picture(picture(*SIZE), "")[..., 0], picture(*SIZE))
+    np.testing.assert_array_equal(found.image(image(*SIZE), "")[..., 0], image(*SIZE))
 
 
 def test_rectified_frames_and_events_are_those_of_opencv(radtan):
@@ -77,8 +77,8 @@ def test_rectified_frames_and_events_are_those_of_opencv(radtan):
     assert placed.rectified
     # OpenCV stops after a few steps of its iteration, hence the tolerance.
     np.testing.assert_allclose(np.stack([placed.x, placed.y], -1), ideal, atol=2e-3)
-    wanted = cv2.undistort(picture(*SIZE), matrix, lens)
-    np.testing.assert_allclose(found.picture(picture(*SIZE), "")[..., 0], wanted, atol=1)
+    wanted = cv2.undistort(image(*SIZE), matrix, lens)
+    np.testing.assert_allclose(found.image(image(*SIZE), "")[..., 0], wanted, atol=1)
 
 
 def test_rectified_events_keep_their_colours(radtan):
@@ -93,7 +93,7 @@ def test_rectified_events_keep_their_colours(radtan):
 def test_raw_colour_becomes_rgb():
     red = np.zeros((HEIGHT, WIDTH), np.uint8)
     red[::2, ::2] = 200  # where the filter of RGGB is red
-    found = geometry(SIZE, SIZE, Optics(), "cam.raw").picture(red, "RGGB")
+    found = geometry(SIZE, SIZE, Optics(), "cam.raw").image(red, "RGGB")
     assert found.shape == (HEIGHT, WIDTH, 3)
     assert found[4, 4].tolist() == [200, 0, 0]
 
@@ -108,7 +108,7 @@ def test_frames_of_a_camera_beside_are_seen_from_the_events(kalibr):
     direction = found.camera.direction(found.camera.grid().double())[3, 7]
     plane = (direction[:2] / direction[2]).numpy()
     np.testing.assert_allclose(found.frame_map[3, 7], plane * [22.0, 23.0] + [11.3, 9.7], atol=1e-4)
-    assert found.picture(picture(24, 20), "").shape == (HEIGHT, WIDTH, 1)
+    assert found.image(image(24, 20), "").shape == (HEIGHT, WIDTH, 1)
 
 
 # What does not fit

@@ -61,9 +61,9 @@ def test_an_edge_is_not_hot():
 
 
 def test_simulated_scenes_have_no_hot_pixels(samples):
-    from sharpfield.recordings.open import Told, open_recording
+    from sharpfield.recordings.open import ReaderOptions, open_recording
 
-    told = Told(unit="ns", size=(300, 200))
+    told = ReaderOptions(unit="ns", size=(300, 200))
     recording = open_recording(samples / "blender" / "atelier" / "events.h5", told)
     found = survey(recording.chunks(), (300, 200), "atelier", lambda count: None)
     assert len(hot_pixels(found.per_pixel, 10.0)) == 0

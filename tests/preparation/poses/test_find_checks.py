@@ -27,7 +27,7 @@ def mapped(relief_of_depth: float, *, sideways: float = 0.25, few: int = 0) -> M
     poses = np.tile(np.eye(3, 4), (VIEWS, 1, 1))
     poses[:, 0, 3] = np.linspace(-0.5, 0.5, VIEWS) * 5 * sideways
     sharing = np.ones((VIEWS, POINTS), bool)
-    # A map is made of what was seen, so noise bends it: half a px, averaged over nine pictures.
+    # A map is made of what was seen, so noise bends it: half a px, averaged over nine images.
     points += 0.5 / 3 * 5 / FOCAL_PX * draw.standard_normal((POINTS, 3)) * [1, 1, 4]
     return Map(
         registered=np.ones(VIEWS, bool),
@@ -94,7 +94,7 @@ def test_the_world_it_is_in_does_not_matter() -> None:
     assert (there.off_plane, there.thickness) == pytest.approx((here.off_plane, here.thickness))
 
 
-def test_pictures_that_share_too_little_say_nothing() -> None:
+def test_images_that_share_too_little_say_nothing() -> None:
     made = mapped(0.0)
     alone = made.sightings[made.sightings[:, 0] == made.sightings[:, 1] % VIEWS]
     lonely = Map(

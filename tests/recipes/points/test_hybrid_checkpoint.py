@@ -83,9 +83,9 @@ def test_points_and_networks_are_those_of_the_file(file: Path):
         "block1.2.weight": field.reading.layers[1].weight,
         "block3.0.bias": field.seeing.layers[0].bias,
         "color_feature_branch.4.weight": field.to_feature.layers[2].weight,
-        "aux_merge_weight_block.6.weight": model.pictures.merging.network.layers[3].weight,
-        "aux_block_s2.2.weight": model.pictures.extractor.stages[1][1].weight,
-        "color_mixup_block.4.bias": model.pictures.mixing.network.layers[2].bias,
+        "aux_merge_weight_block.6.weight": model.images.merging.network.layers[3].weight,
+        "aux_block_s2.2.weight": model.images.extractor.stages[1][1].weight,
+        "color_mixup_block.4.bias": model.images.mixing.network.layers[2].bias,
         "color_final_block.0.weight": model.head.layer.layers[0].weight,
         "learn_blur_kernel_block.6.weight": model.blur.network.layers[3].weight,
     }

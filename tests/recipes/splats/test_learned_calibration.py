@@ -12,31 +12,31 @@ from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.events.threshold import LearnedThresholds
 from sharpfield.formation.mix import mix
-from sharpfield.geometry.trajectory import LearnedKnots, LearnedShake, Still
+from sharpfield.geometry.trajectory import LearnedExposureMotion, LearnedKnots, Still
 from sharpfield.recipes.splat import EvSplat
 from sharpfield.recipes.splats.learned_calibration import (
     OFFSET_UNIT_US,
-    UnknownOptions,
-    Unknowns,
+    LearnedCalibration,
+    LearnedCalibrationOptions,
     pose_groups,
+    with_learned_exposure_motion,
     with_learned_poses,
-    with_learned_shake,
 )
 from sharpfield.recipes.splats.model import SplatModel
 from sharpfield.recipes.splats.scene import GaussianOptions
-from sharpfield.sampling.views import LookOptions
+from sharpfield.sampling.views import SamplingOptions
 
-ALL = UnknownOptions(
+ALL = LearnedCalibrationOptions(
     threshold=(0.3, 0.1), thresholds="pixels", response="residual", gains=True, knots=5, offset=True
 )
-NONE = UnknownOptions(threshold=(0.3, 0.1))
+NONE = LearnedCalibrationOptions(threshold=(0.3, 0.1))
 
 
-def model(capture: Capture, unknowns: UnknownOptions, **looks) -> SplatModel:
+def model(capture: Capture, unknowns: LearnedCalibrationOptions, **looks) -> SplatModel:
     recipe = EvSplat(
         steps=100,
         gaussians=GaussianOptions(budget=300, growth="none"),
-        looks=LookOptions(early=0.0, **looks),
+        looks=SamplingOptions(early=0.0, **looks),
         unknowns=unknowns,
     )
     return recipe.build(capture, 0)
@@ -48,7 +48,7 @@ def total(terms: dict[str, Tensor]) -> Tensor:
 
 def batches(made: SplatModel) -> list[Batch]:
     return [
-        made.looks.exposure(2, events=True, belief=made.unknowns.belief()),
+        made.looks.exposure(2, events=True, sensor_estimate=made.unknowns.sensor_estimate()),
         made.looks.stretch(3),
     ]
 
@@ -140,7 +140,7 @@ def test_thresholds_go_towards_those_of_the_sensor(tiny: Capture):
     """Events of a sensor with larger thresholds than the guess ask for larger ones."""
     truth = light_of(model(tiny, NONE))
     for guess, sign in (((0.2, 0.07), 1), ((0.4, 0.14), -1)):
-        made = model(tiny, UnknownOptions(threshold=guess, thresholds="signs"))
+        made = model(tiny, LearnedCalibrationOptions(threshold=guess, thresholds="signs"))
         thresholds = made.unknowns.thresholds
         assert isinstance(thresholds, LearnedThresholds)
         slope = sum(slope_of(made, truth, thresholds.log_factor, 0, step) for step in range(6))
@@ -157,7 +157,10 @@ def test_knots_go_back_to_where_the_camera_was(tiny: Capture):
         moved[axis] = 0.02
         with torch.no_grad():
             made.path.twist += moved
-        batch = blurred(truth, made.looks.exposure(1, events=False, belief=made.unknowns.belief()))
+        batch = blurred(
+            truth,
+            made.looks.exposure(1, events=False, sensor_estimate=made.unknowns.sensor_estimate()),
+        )
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], made.path.twist)[0]
         assert slope.sum((0, 1))[axis] > 0, "going down the slope undoes the move"
 
@@ -178,7 +181,9 @@ def test_a_brighter_exposure_asks_for_a_larger_gain(tiny: Capture):
     assert gains is not None and len(gains) == len(tiny.needed_frames)
     for factor, sign in ((1.2, 1), (0.8, -1)):
         batch = blurred(
-            truth, made.looks.exposure(1, events=False, belief=made.unknowns.belief()), gain=factor
+            truth,
+            made.looks.exposure(1, events=False, sensor_estimate=made.unknowns.sensor_estimate()),
+            gain=factor,
         )
         frame = int(batch["frames"].frame[0, 0, 0])
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], gains)[0]
@@ -186,7 +191,7 @@ def test_a_brighter_exposure_asks_for_a_larger_gain(tiny: Capture):
 
 
 def test_gains_can_not_all_rise_together(tiny: Capture):
-    unknowns = Unknowns(UnknownOptions(gains=True), tiny, 0)
+    unknowns = LearnedCalibration(LearnedCalibrationOptions(gains=True), tiny, 0)
     assert unknowns.log_gain is not None and unknowns.prior() is not None
     unknowns.log_gain.data += torch.tensor([0.3, -0.3] * 3)
     assert float(unknowns.prior().detach()) == pytest.approx(0, abs=1e-12)
@@ -195,18 +200,18 @@ def test_gains_can_not_all_rise_together(tiny: Capture):
 
 
 def test_what_is_known_needs_no_prior(tiny: Capture):
-    assert Unknowns(NONE, tiny, 0).prior() is None
-    assert not list(Unknowns(NONE, tiny, 0).parameters())
+    assert LearnedCalibration(NONE, tiny, 0).prior() is None
+    assert not list(LearnedCalibration(NONE, tiny, 0).parameters())
 
 
 def test_thresholds_come_from_the_capture_unless_given(tiny: Capture):
     noted = replace(tiny, notes={**tiny.notes, "threshold_off": 0.31, "threshold_on": 0.17})
-    assert Unknowns(UnknownOptions(), noted, 0).guess == (0.31, 0.17)
-    assert Unknowns(NONE, noted, 0).guess == (0.3, 0.1)
+    assert LearnedCalibration(LearnedCalibrationOptions(), noted, 0).guess == (0.31, 0.17)
+    assert LearnedCalibration(NONE, noted, 0).guess == (0.3, 0.1)
 
 
 def test_an_offset_is_in_microseconds_of_the_events_clock(tiny: Capture):
-    unknowns = Unknowns(UnknownOptions(offset=True), tiny, 0)
+    unknowns = LearnedCalibration(LearnedCalibrationOptions(offset=True), tiny, 0)
     assert unknowns.offset_steps is not None
     unknowns.offset_steps.data += 2.5
     assert unknowns.offset_us == 2500
@@ -227,8 +232,8 @@ def test_photos_of_unknown_motion_get_a_motion_each(tiny: Capture):
     poses = tiny.frame_pose(np.arange(6)).double().numpy()
     frames = replace(tiny.needed_frames, track=np.arange(6))  # as readers of photos make it
     photos = replace(tiny, trajectory=Still(poses), frames=frames)
-    made = with_learned_shake(photos, 0)
-    assert isinstance(made.trajectory, LearnedShake)
+    made = with_learned_exposure_motion(photos, 0)
+    assert isinstance(made.trajectory, LearnedExposureMotion)
     exposure = made.needed_frames.exposure
     assert (exposure.duration_us > 0).all()
     assert np.abs(exposure.middle_us - frames.exposure.middle_us).max() <= 1

@@ -132,11 +132,11 @@ def test_what_is_no_event_is_told_apart(tmp_path: Path) -> None:
     assert read.triggers().t_us.tolist() == [11]
 
 
-def frame_records(start_us: int, picture: np.ndarray, *, rolling: bool) -> list[tuple[int, int]]:
+def frame_records(start_us: int, image: np.ndarray, *, rolling: bool) -> list[tuple[int, int]]:
     """Readings of a frame, column by column from the right, a us each."""
 
     def column(x: int, kind: int, t: int) -> list[tuple[int, int]]:
-        samples = 800 - (picture[:, x] if kind else np.zeros(HEIGHT, int))
+        samples = 800 - (image[:, x] if kind else np.zeros(HEIGHT, int))
         return [(davis_sample(x, y, kind, int(v)), t) for y, v in enumerate(samples)]
 
     order = range(WIDTH - 1, -1, -1)
@@ -149,21 +149,21 @@ def frame_records(start_us: int, picture: np.ndarray, *, rolling: bool) -> list[
 
 @pytest.mark.parametrize(("rolling", "opened", "closed"), [(False, 239, 5000), (True, 0, 40)])
 def test_frames_and_their_exposures(tmp_path: Path, rolling, opened, closed) -> None:
-    pictures = np.random.default_rng(0).integers(0, 700, (2, HEIGHT, WIDTH))
+    images = np.random.default_rng(0).integers(0, 700, (2, HEIGHT, WIDTH))
     records = [(davis_event(0, 0, 1), 1)]
-    records += frame_records(1000, pictures[0], rolling=rolling)
-    records += frame_records(30_000, pictures[1], rolling=rolling)
+    records += frame_records(1000, images[0], rolling=rolling)
+    records += frame_records(30_000, images[1], rolling=rolling)
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records))
     frames = list(read.frames())
     assert len(frames) == 2 and not str(read.trouble)
-    for frame, picture, start_us in zip(frames, pictures, (1000, 30_000), strict=True):
-        np.testing.assert_array_equal(frame.image, picture << 6)
+    for frame, image, start_us in zip(frames, images, (1000, 30_000), strict=True):
+        np.testing.assert_array_equal(frame.image, image << 6)
         assert (frame.open_us, frame.close_us) == (start_us + opened, start_us + closed)
 
 
 def test_a_torn_frame_is_counted(tmp_path: Path) -> None:
-    picture = np.full((HEIGHT, WIDTH), 9)
-    records = frame_records(0, picture, rolling=False)
+    image = np.full((HEIGHT, WIDTH), 9)
+    records = frame_records(0, image, rolling=False)
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records[:-1]))
     assert not list(read.frames())
     assert read.trouble.counts == {"torn frames": 1}

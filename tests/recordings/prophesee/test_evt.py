@@ -7,7 +7,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.open import format_of
 from sharpfield.recordings.prophesee.evt import decoded, open_evt, trigger_edges
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.recording import ReadLog
 from sharpfield.storage.evt_writer import writing_evt
 from tests.recordings import fuzz
 from tests.streams import random_events
@@ -84,7 +84,7 @@ def listed(events: EventStream) -> list[Event]:
 def decode(
     encoding: str, data: bytes, *, block: int = 2**20, size: tuple[int, int] = HD
 ) -> tuple[list[Event], str]:
-    trouble = Trouble()
+    trouble = ReadLog()
     cut = [data[i : i + block] for i in range(0, len(data), block)]
     found = decoded(encoding, cut, size, where="test", trouble=trouble)
     return [event for part in found for event in listed(part)], str(trouble)

@@ -3,7 +3,13 @@ import pytest
 
 from sharpfield.core.errors import OptionError
 from sharpfield.simulation.cameras.motion import motion
-from sharpfield.simulation.cameras.rigs import Carried, Standing, hand_held, ring, ring_pose
+from sharpfield.simulation.cameras.rigs import (
+    CarriedCamera,
+    StillCamera,
+    hand_held,
+    ring,
+    ring_pose,
+)
 
 PUBLISHED = [  # OpenGL axes: right, up, back
     [0.98481, 0.08682, -0.15038, -0.60153],
@@ -28,7 +34,7 @@ def test_cameras_look_at_the_origin():
         rotation, centre = camera.pose[:, :3], camera.pose[:, 3]
         np.testing.assert_allclose(rotation.T @ -centre, [0, 0, 4], atol=1e-12)
         np.testing.assert_allclose(rotation.T @ rotation, np.eye(3), atol=1e-12)
-        assert np.linalg.det(rotation) > 0 and rotation[2, 1] < 0  # z is up in the picture
+        assert np.linalg.det(rotation) > 0 and rotation[2, 1] < 0  # z is up in the image
 
 
 def test_the_published_rings_are_half_a_step_apart():
@@ -45,10 +51,10 @@ def test_few_held_out_views_are_spread_over_the_ring():
 
 def test_standing_cameras_stand_and_carried_ones_move():
     times = np.array([0, 300_000, 700_000])
-    still = Standing(ring_pose(10)).poses(times)
+    still = StillCamera(ring_pose(10)).poses(times)
     np.testing.assert_array_equal(still, np.stack([ring_pose(10)] * 3))
     base, path = ring_pose(-90), motion("shaky", 3)
-    poses = Carried(base, path).poses(times)
+    poses = CarriedCamera(base, path).poses(times)
     for pose, own in zip(poses, path.poses(times), strict=True):
         square = [np.concatenate([p, [[0, 0, 0, 1]]]) for p in (base, own)]
         np.testing.assert_allclose(pose, (square[0] @ square[1])[:3], atol=1e-12)

@@ -51,7 +51,7 @@ def test_a_stretched_box_is_a_larger_box():
 
 
 def test_a_swollen_ball_keeps_its_pattern():
-    """Twice as large from twice as far away: the same picture, texture included."""
+    """Twice as large from twice as far away: the same image, texture included."""
     checks = Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=8.0)
     origin, direction = rays()
     rest = scene([ball((0.1, 0, 0), 0.6, checks)])

@@ -4,17 +4,17 @@ import torch
 
 from sharpfield.core.camera import Camera
 from sharpfield.simulation.cameras.motion import Motion, motion
-from sharpfield.simulation.cameras.rigs import Carried, Standing, ring_pose
+from sharpfield.simulation.cameras.rigs import CarriedCamera, StillCamera, ring_pose
 from sharpfield.simulation.scenes.flow import depth_and_flow
 from sharpfield.simulation.scenes.moving import MOVING_SCENES, moving_scene
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.simulate import Rig, view
 
 CAMERA = Camera(64, 64, 89.0, 89.0, 32.0, 32.0)
-RING = Standing(ring_pose(-90))
+RING = StillCamera(ring_pose(-90))
 CASES = {
     **{name: (moving_scene(name), RING) for name in MOVING_SCENES},
-    "carried": (moving_scene("spinner"), Carried(ring_pose(-70), motion("glide", 1))),
+    "carried": (moving_scene("spinner"), CarriedCamera(ring_pose(-70), motion("glide", 1))),
     "sway": (scene("mobile"), motion("glide", 1)),
 }
 
@@ -45,7 +45,7 @@ def test_what_is_followed_looks_the_same_a_moment_later(name):
     assert error.mean() < 0.3 * naive.mean()
 
 
-def test_depth_is_that_of_the_picture():
+def test_depth_is_that_of_the_image():
     place, path = CASES["arm"]
     depth, _ = depth_and_flow(place, CAMERA, path, 250_000)
     _, drawn = view(place, CAMERA, path.pose, 0.25)

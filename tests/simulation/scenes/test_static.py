@@ -100,12 +100,12 @@ def test_a_wide_pixel_sees_the_mean_of_narrow_ones(texture):
     paint = Paint("#202020", "#f0f0f0", "#808080", texture, 2.0)
     place, small = made(rectangle((0, 0, 4.0), (20, 20), paint)), Rig((60, 40)).camera()
     fine = view(place, small.scaled(6.0), HOME)[0]
-    shrunk = fine.reshape(40, 6, 60, 6, 3).mean((1, 3))
+    downscaled = fine.reshape(40, 6, 60, 6, 3).mean((1, 3))
     direct = view(place, small, HOME)[0]
     across = small.direction(small.grid().double()).reshape(-1, 3).numpy()
     aliased = place.light(np.zeros((1, 3)), across, footprint_rad=1e-4)[0].reshape(40, 60, 3)
-    assert (direct - shrunk).std() < 0.45 * (aliased - shrunk).std()
-    assert abs(direct.mean() - shrunk.mean()) < 0.025
+    assert (direct - downscaled).std() < 0.45 * (aliased - downscaled).std()
+    assert abs(direct.mean() - downscaled.mean()) < 0.025
 
 
 def test_shadows_fall_away_from_the_sun():

@@ -266,7 +266,7 @@ def test_lin_log_is_the_logarithm_in_light_and_straight_in_the_dark():
     assert dark == int(0.03 / (20 / 255) / 0.1) and light == int(np.log(2.5) / 0.1)
 
 
-def test_watching_bounds_the_change_between_pictures():
+def test_watching_bounds_the_change_between_images():
     def render(t_us: int) -> np.ndarray:
         value = 0.5 + 0.4 * np.sin(2 * np.pi * t_us / 40_000 + np.arange(6.0))
         return np.tile(value[None, :, None], (2, 1, 3)).astype(np.float32)
@@ -282,7 +282,7 @@ def test_watching_bounds_the_change_between_pictures():
         np.testing.assert_array_equal(rgb, render(t_us))
 
 
-def test_one_picture_and_one_pixel():
+def test_one_image_and_one_pixel():
     pixels = EventPixels(EventSensor(), 0)
     first = pixels.see(np.full((1, 1), 0.5, np.float32), 7)
     assert isinstance(first, Gap) and len(first.x) == 0

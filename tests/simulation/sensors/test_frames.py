@@ -20,11 +20,11 @@ def show(exposing: Exposing, times, light) -> np.ndarray:
 
 
 def test_still_light_blurs_nothing():
-    picture = np.random.default_rng(0).uniform(size=(4, 5, 3)).astype(np.float32)
+    image = np.random.default_rng(0).uniform(size=(4, 5, 3)).astype(np.float32)
     means = show(
-        Exposing(exposures((0, 30), (35, 35), (40, 70)), (5, 4)), range(0, 71, 7), lambda t: picture
+        Exposing(exposures((0, 30), (35, 35), (40, 70)), (5, 4)), range(0, 71, 7), lambda t: image
     )
-    np.testing.assert_allclose(means, np.broadcast_to(picture, means.shape), rtol=1e-6)
+    np.testing.assert_allclose(means, np.broadcast_to(image, means.shape), rtol=1e-6)
 
 
 def test_the_mean_of_straight_light_is_that_of_the_middle():
@@ -83,7 +83,7 @@ def test_photon_and_read_noise_have_their_size():
     assert np.ptp(clean) == 0
 
 
-def test_pictures_must_cover_exposures():
+def test_images_must_cover_exposures():
     exposing = Exposing(exposures((0, 100)), (5, 4))
     with pytest.raises(
         OptionError, match="do not cover.*\n  where  exposure 0\n  got    60 of 100 us"

@@ -61,20 +61,20 @@ def test_an_even_line_is_as_long_as_it_looks():
 @pytest.mark.parametrize("k", [5, 6])
 def test_blur_is_convolution_and_keeps_size_and_brightness(k):
     kernel = motion_kernel(k, 0.5, draw(3))
-    picture = draw(1).integers(0, 256, (20, 24, 3)).astype(np.uint8)
-    made = blurred(picture, kernel)
-    assert made.shape == picture.shape and made.dtype == np.uint8
+    image = draw(1).integers(0, 256, (20, 24, 3)).astype(np.uint8)
+    made = blurred(image, kernel)
+    assert made.shape == image.shape and made.dtype == np.uint8
     origin = 0 if k % 2 else -1  # of scipy's kernels of even size
     for channel in range(3):
         slow = convolve(
-            picture[..., channel].astype(float), kernel.astype(float), mode="nearest", origin=origin
+            image[..., channel].astype(float), kernel.astype(float), mode="nearest", origin=origin
         )
         np.testing.assert_allclose(made[..., channel], slow, atol=0.51)
     even = np.full((9, 9, 1), 40_000, np.uint16)
     np.testing.assert_array_equal(blurred(even, kernel), even)
 
 
-def test_the_share_of_blurred_pictures_is_as_told():
+def test_the_share_of_blurred_images_is_as_told():
     ranges = KernelRange((3, 16), (0.0, 0.1), 0.75)
     drawn = [drawn_blur(ranges, draw(seed)) for seed in range(400)]
     made = [one for one in drawn if one is not None]

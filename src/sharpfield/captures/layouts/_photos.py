@@ -1,4 +1,4 @@
-"""Posed photographs: pictures whose poses are known, but not how the camera moved meanwhile.
+"""Posed photographs: images whose poses are known, but not how the camera moved meanwhile.
 
 Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds.
 Whether such photos are blurred by motion, their exposures cannot tell; `notes["motion"]` is
@@ -32,7 +32,7 @@ Missing = Literal["error", "skip"]
 
 @dataclass(frozen=True)
 class Photos:
-    """Pictures of one camera with their poses."""
+    """Images of one camera with their poses."""
 
     images: Shaped[np.ndarray, "n h w c"]
     """As stored."""
@@ -58,7 +58,7 @@ def photo_capture(
     """A capture of photos that were taken one by one.
 
     Args:
-        photos: The pictures.
+        photos: The images.
         split: Which are learned from.
         bounds: Nearest and farthest depth of the scene.
         name: Name of the scene.

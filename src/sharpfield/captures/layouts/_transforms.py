@@ -3,7 +3,7 @@
 The columns of `transform_matrix` are the camera's right, up and backward axes and its centre in
 the world; here the axes become OpenCV's right, down, forward.
 
-Pictures of a scene that moves, taken from known poses at known times: `transforms_<set>.json`.
+Images of a scene that moves, taken from known poses at known times: `transforms_<set>.json`.
 
 Each frame has a `time` of 0...1 beside its pose, and the set has a `camera_angle_x`. The
 recording is said to last one second, since these files know no other unit.

@@ -3,7 +3,7 @@
     train/pose/*.txt          camera-to-world, 16 numbers, OpenCV axes; pose i of n at i / (n - 1)
     train/intrinsics/*.txt    16 numbers (a 4x4 matrix), or 20: a fifth row begins with k1, k2
     train/events/NAME.npz     x, y, t, p; t in a unit that the files do not say
-    train/rgb/*.png           a picture for each pose, if there are any
+    train/rgb/*.png           a image for each pose, if there are any
     test/, validation/        pose, intrinsics and rgb of other views, if there are any
 
 Time runs from 0 to the last event's. Its unit must be given: the authors only use t over its
@@ -40,7 +40,7 @@ def recognise(folder: Path) -> bool:
 
 
 def read(folder: Path, *, event_unit: str | None = None) -> Capture:
-    """Read the events, the poses, and the pictures if there are any.
+    """Read the events, the poses, and the images if there are any.
 
     Args:
         folder: Holds what the module describes.
@@ -73,7 +73,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     times_us = np.rint(np.linspace(0, clock.span_us, len(poses))).astype(np.int64)
     path = Stamped(times_us, poses, clock, "linear")
     others = [folder / name for name in ("test", "validation")]
-    held_out = next((other for other in others if _pictures(other)), None)
+    held_out = next((other for other in others if _images(other)), None)
     still = np.zeros((0, 3, 4)) if held_out is None else _poses(held_out)
     frames, split = _frames(train, held_out, times_us, len(still))
     near, far = guessed_bounds(poses)
@@ -92,22 +92,22 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     )
 
 
-def _pictures(folder: Path) -> list[Path]:
-    """The pictures of a set, if there are any."""
+def _images(folder: Path) -> list[Path]:
+    """The images of a set, if there are any."""
     return list_images(folder / "rgb") if (folder / "rgb").is_dir() else []
 
 
 def _frames(
     train: Path, held_out: Path | None, times_us: Int64[np.ndarray, "p"], others: int
 ) -> tuple[Frames | None, Split]:
-    """Pictures on the moving track, and held-out ones on tracks of their own."""
-    moving, still = _pictures(train), [] if held_out is None else _pictures(held_out)
+    """Images on the moving track, and held-out ones on tracks of their own."""
+    moving, still = _images(train), [] if held_out is None else _images(held_out)
     for name, found, poses in (("train", moving, len(times_us)), ("held-out", still, others)):
         if found and len(found) != poses:
             raise CaptureError(
-                f"there must be a pose for each {name} picture",
+                f"there must be a pose for each {name} image",
                 where=found[0].parent,
-                got=f"{len(found)} pictures, {poses} poses",
+                got=f"{len(found)} images, {poses} poses",
             )
     if not moving and not still:
         return None, Split(np.zeros(0, np.int64), np.zeros(0, np.int64))

@@ -101,13 +101,13 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
         CaptureError: Something is missing, malformed, or does not fit together.
     """
     variant = variant_of(folder)
-    pictures = choose_images(folder, None)
-    paths = list_images(pictures)
+    image_folder = choose_images(folder, None)
+    paths = list_images(image_folder)
     table = read_poses_bounds(folder / "poses_bounds.npy")
-    exposure = _exposure(pictures / "timestamps.npz")
+    exposure = _exposure(image_folder / "timestamps.npz")
     _expect_one_each(folder, images=len(paths), poses=len(table), exposures=len(exposure))
     images = read_images(paths)
-    camera = _camera(images, table, factor=_factor(pictures))
+    camera = _camera(images, table, factor=_factor(image_folder))
     along, path = _trajectory(folder)
     bounds = (along if variant.reference_poses == "trajectory" else table).bounds
     off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
@@ -173,8 +173,8 @@ def _camera(images: Shaped[np.ndarray, "n h w c"], table: PosesBounds, *, factor
     return Camera(width, height, focal, focal, width / 2, height / 2)
 
 
-def _factor(pictures: Path) -> float:
-    match = re.fullmatch(r"images_(\d+)", pictures.name)
+def _factor(images: Path) -> float:
+    match = re.fullmatch(r"images_(\d+)", images.name)
     return float(match[1]) if match else 1.0
 
 

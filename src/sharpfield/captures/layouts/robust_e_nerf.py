@@ -5,10 +5,10 @@
                               world-from-camera, OpenCV axes
     camera_calibration.npz    intrinsics, distortion, img_height, img_width, bayer_pattern,
                               thresholds, refractory period in ns
-    views/transforms_test.json, or ../views/     pictures to be predicted, if there are any
+    views/transforms_test.json, or ../views/     images to be predicted, if there are any
 
 Intrinsics count pixels from the centre of the first, ours from its corner. Poses are joined by
-straight lines. Pictures of another size than the event camera's, or not PNG or JPEG, are left out,
+straight lines. Images of another size than the event camera's, or not PNG or JPEG, are left out,
 and the notes say so.
 
 Source: Low and Lee, *Robust e-NeRF* (ICCV 2023), and its data loader.
@@ -54,7 +54,7 @@ def recognise(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Read the events, the poses, and the pictures to be predicted.
+    """Read the events, the poses, and the images to be predicted.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -166,7 +166,7 @@ def _notes(calibration: Arrays) -> dict[str, Note]:
 
 @dataclass(frozen=True)
 class _Views:
-    """Pictures to be predicted, each on a still track of its own."""
+    """Images to be predicted, each on a still track of its own."""
 
     frames: Frames | None = None
     poses: Float64[np.ndarray, "v 3 4"] = field(default_factory=lambda: np.zeros((0, 3, 4)))

@@ -96,7 +96,7 @@ def describe(
     frames: list[dict[str, Any]] | None,
     depth: dict[str, Any] | None = None,
 ) -> None:
-    """Write all that is not pictures or events, for which these must be in the folder already.
+    """Write all that is not images or events, for which these must be in the folder already.
 
     Args:
         capture: Of which images and events are not looked at.

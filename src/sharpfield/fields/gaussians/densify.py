@@ -32,7 +32,7 @@ FADED = 0.01
 """Opacity to which all are reduced now and then."""
 
 
-class Watch(nn.Module):
+class GradientStats(nn.Module):
     """How much Gaussians have wished to move since they last multiplied.
 
     Args:
@@ -48,7 +48,7 @@ class Watch(nn.Module):
         self.register_buffer("times", torch.zeros(count))
 
     @property
-    def wish(self) -> Float[Tensor, "n"]:
+    def mean_grad(self) -> Float[Tensor, "n"]:
         """Mean over the views that saw each Gaussian."""
         return self.total / self.times.clamp_min(1)
 
@@ -80,10 +80,10 @@ class Watch(nn.Module):
 
 
 @dataclass(frozen=True)
-class Densifying:
+class DensifyOptions:
     """When Gaussians are cloned, split and dropped. Defaults: the paper's."""
 
-    wish: float = 2e-4
+    mean_grad: float = 2e-4
     """Wish to move from which on a Gaussian is doubled."""
     large: float = 0.01
     """Largest scale, as a fraction of the extent, above which it is split rather than cloned."""
@@ -93,18 +93,18 @@ class Densifying:
 
 def densify(
     gaussians: Gaussians,
-    wish: Float[Tensor, "n"],
+    mean_grad: Float[Tensor, "n"],
     extent: float,
     *,
     budget: int,
     generator: Generator,
-    options: Densifying | None = None,
+    options: DensifyOptions | None = None,
 ) -> Growth | None:
     """Clone small and split large Gaussians that wish to move; drop transparent and huge ones.
 
     Args:
         gaussians: As they are.
-        wish: Of each, by `Watch`.
+        mean_grad: Of each, by `GradientStats`.
         extent: Size of the scene in world units.
         budget: Most Gaussians there may be.
         generator: On the device of the Gaussians.
@@ -113,10 +113,12 @@ def densify(
     Returns:
         None if all stay as they are.
     """
-    options = options or Densifying()
+    options = options or DensifyOptions()
     largest = gaussians.scales.detach().amax(-1)
     useful = (gaussians.opacities.detach() >= DEAD) & (largest <= options.huge * extent)
-    doubled = _doubled(wish, useful & (wish >= options.wish), budget - int(useful.sum()))
+    doubled = _doubled(
+        mean_grad, useful & (mean_grad >= options.mean_grad), budget - int(useful.sum())
+    )
     if useful.all() and not doubled.any():
         return None
     split = doubled & (largest > options.large * extent)
@@ -139,9 +141,11 @@ def fade(opacity_logits: Float[Tensor, "n"]) -> Growth:
     return replace(growth, values={"opacity_logits": opacity_logits.detach().clamp_max(most)})
 
 
-def _doubled(wish: Float[Tensor, "n"], wishing: Bool[Tensor, "n"], room: int) -> Bool[Tensor, "n"]:
+def _doubled(
+    mean_grad: Float[Tensor, "n"], wishing: Bool[Tensor, "n"], room: int
+) -> Bool[Tensor, "n"]:
     """Those of the wishing that there is room for."""
-    order = torch.where(wishing, wish, -1.0).argsort(descending=True, stable=True)
+    order = torch.where(wishing, mean_grad, -1.0).argsort(descending=True, stable=True)
     allowed = torch.zeros_like(wishing)
     allowed[order[: max(room, 0)]] = True
     return wishing & allowed

@@ -66,7 +66,7 @@ class MovingGaussians(Gaussians):
         bend = self.accelerations[there] / 2 + since * self.jerks[there] / 6
         path = self.velocities[there] + since * bend
         turned = product(half_turn(self.turns[there] * since), self.quaternions[there])
-        return Passing(
+        return GaussiansAtTime(
             means=self.means[there] + since * path,
             quaternions=turned,
             scales=self.scales[there],
@@ -77,7 +77,7 @@ class MovingGaussians(Gaussians):
 
 
 @dataclass(frozen=True)
-class Passing:
+class GaussiansAtTime:
     """Moving Gaussians at one time."""
 
     means: Float[Tensor, "n 3"]
@@ -94,11 +94,11 @@ class Passing:
 
 
 @dataclass(frozen=True)
-class Together:
+class GaussianUnion:
     """Gaussians that stand still, and moving ones at one time."""
 
     still: Gaussians
-    passing: Passing
+    passing: GaussiansAtTime
 
     @property
     def means(self) -> Float[Tensor, "n 3"]:

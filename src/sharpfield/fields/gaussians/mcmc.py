@@ -1,9 +1,9 @@
 """Gaussians as samples of a distribution: those of no use move to where the others are.
 
-The transparent ones are *dead*: they take a *seat* at the place of a live one, and all that then
-*share* a place get the opacity and the scales with which they look as the one did before. More
-seats are made until a budget is reached. Between these moves noise lets transparent Gaussians
-`wander`, and a penalty on opacity and scale frees those of little use. All of it depends on the
+*Relocation*: dead (transparent) Gaussians move to where live ones are, drawn by opacity, and all
+Gaussians at one point get the opacity and scales with which they look as the one did before. More
+are added in the same way until a maximum is reached. Between relocations, noise moves transparent
+Gaussians, and a penalty on opacity and scale frees those of little use. All of it depends on the
 Gaussians as they are and on the generator that is passed in.
 
 Source: Kheradmand et al., "3D Gaussian splatting as Markov chain Monte Carlo" (NeurIPS 2024). It
@@ -33,7 +33,7 @@ GATE = 100.0
 """How sharply the noise sets in where the opacity falls to `DEAD`."""
 
 
-def share_out(
+def relocate_and_add(
     log_scales: Float[Tensor, "n 3"],
     opacity_logits: Float[Tensor, "n"],
     *,
@@ -41,7 +41,7 @@ def share_out(
     generator: Generator,
     more: float = 0.05,
 ) -> Growth | None:
-    """Move dead Gaussians onto live ones, and add some, so that the picture stays the same.
+    """Move dead Gaussians onto live ones, and add some, so that the image stays the same.
 
     Live ones are chosen by chance, in proportion to their opacity.
 
@@ -59,19 +59,19 @@ def share_out(
     opacity = opacity_logits.detach().double().sigmoid()
     dead, live = torch.nonzero(opacity <= DEAD)[:, 0], torch.nonzero(opacity > DEAD)[:, 0]
     added = max(min(int((1 + more) * count), budget) - count, 0)
-    seats = torch.cat([dead, torch.arange(count, count + added, device=device)])
-    if not len(seats) or not len(live):
+    camera_streams = torch.cat([dead, torch.arange(count, count + added, device=device)])
+    if not len(camera_streams) or not len(live):
         return None
-    chosen = live[_drawn(opacity[live], len(seats), generator)]
+    chosen = live[_drawn(opacity[live], len(camera_streams), generator)]
     place, sharing = chosen.unique(return_counts=True)
     new_opacity, factor = shared(opacity[place], sharing + 1)
     logits, scales = opacity_logits.detach().clone(), log_scales.detach().clone()
     logits[place] = new_opacity.logit().to(logits)
     scales[place] += factor.log().to(scales)[:, None]
     source = torch.arange(count + added, device=device)
-    source[seats] = chosen
+    source[camera_streams] = chosen
     fresh = torch.zeros_like(source, dtype=torch.bool)
-    fresh[seats] = True
+    fresh[camera_streams] = True
     return Growth(source, fresh, {"opacity_logits": logits[source], "log_scales": scales[source]})
 
 
@@ -99,7 +99,7 @@ def shared(
     return new, opacity / stopped
 
 
-def wander(
+def position_noise(
     gaussians: Gaussians, rate: float, generator: Generator, *, noise: float = NOISE
 ) -> Float[Tensor, "n 3"]:
     """Noise to add to the means after a step: as far as a Gaussian reaches, if it is transparent.
@@ -119,7 +119,7 @@ def wander(
         return rate * noise * gate[:, None] * along
 
 
-def idleness(gaussians: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+def opacity_scale_penalty(gaussians: Gaussians) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Mean opacity and mean scale. As losses (published: 0.01 of each) they free useless ones."""
     return gaussians.opacities.mean(), gaussians.scales.mean()
 

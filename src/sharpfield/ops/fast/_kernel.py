@@ -1,5 +1,5 @@
 # pyright: basic
-"""How kernels are compiled, and how they share the processor.
+"""How kernels are compiled, and how they share the CPU.
 
 Vocabulary: a *kernel* is a function of numpy arrays that numba compiles, once per set of types and
 machine; the result is kept beside the source, or in the user's cache folder where that cannot be

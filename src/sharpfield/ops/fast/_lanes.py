@@ -3,7 +3,7 @@
 
 Kernels that combine a few scattered rows of channels defeat the compiler's own search for vector
 instructions: it cannot know that the rows do not overlap. Saying it outright is several times
-faster. `Lanes` of any power of two work on any processor; the compiler splits or widens them to the
+faster. `Lanes` of any power of two work on any CPU; the compiler splits or widens them to the
 registers at hand.
 
     row = load(features, start, lanes) * weight + load(features, other, lanes) * (1 - weight)
@@ -25,7 +25,7 @@ from numba import types
 from numba.extending import intrinsic, models, overload, register_model
 
 WIDEST = 16
-"""A cache line of float32, and the widest register of today's processors."""
+"""A cache line of float32, and the widest register of today's CPUs."""
 
 CONTRACT = ("contract",)
 INT32 = ir.IntType(32)

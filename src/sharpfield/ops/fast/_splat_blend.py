@@ -1,5 +1,5 @@
 # pyright: basic
-"""Blending splats in tiles, and back. A row of a tile is one vector of the processor.
+"""Blending splats in tiles, and back. A row of a tile is one vector of the CPU.
 
 A *splat* is a row of numbers: centre x, y, conic xx, xy, yy, opacity, half its height in pixels,
 then its *features*: the colour's channels and depth. A *touch* is a splat that reaches a tile: the
@@ -132,13 +132,13 @@ def _wanted_of_tile(item, images, wanted, gradient, behind, features):
 
 
 @kernel
-def blend_back(worker, workers, plan, splats, pictures, touch_sums, lanes, features):
+def blend_back(worker, workers, plan, splats, views, touch_sums, lanes, features):
     """Write the gradient of each touch: centre, conic, opacity, features.
 
-    The pictures are those that `blend` filled, and their gradient.
+    The views are those that `blend` filled, and their gradient.
     """
     shares, starts, touches = plan
-    images, wanted = pictures
+    images, wanted = views
     size = TILE * TILE
     left = np.empty(size, np.float32)
     behind = np.empty(size, np.float32)

@@ -1,7 +1,7 @@
 # pyright: basic
 """Plane and line lookups on the CPU.
 
-Points are worked through in chunks whose taps and features stay in the processor's cache, so that
+Points are worked through in chunks whose taps and features stay in the CPU's cache, so that
 mixing them costs no trip to memory. Nothing is kept for the backward pass but the arguments.
 """
 

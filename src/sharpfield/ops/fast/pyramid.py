@@ -48,7 +48,7 @@ class _LookUp(torch.autograd.Function):
             of_xy = torch.zeros_like(xy)
             spread(_slope, *at, maps, grad, memory(of_xy))
         of_levels: list[Tensor | None] = [None] * len(levels)
-        # A picture is no parameter: its level is left out, and so are its channels.
+        # A image is no parameter: its level is left out, and so are its channels.
         wanted = np.array(ctx.needs_input_grad[2:])
         if wanted.any():
             sums = tuple(np.zeros_like(one) for one in maps)

@@ -58,7 +58,7 @@ def _(
     tensors = (means, quaternions, scales, opacities, colours, poses)
     if not len(means) or any(tensor.dtype != torch.float32 for tensor in tensors):
         return rasterize.reference(*tensors, canvas, shift)
-    gsplat = need("gsplat", extra="gpu", purpose="drawing Gaussians on a graphics card")
+    gsplat = need("gsplat", extra="gpu", purpose="drawing Gaussians on a GPU")
     camera, (width, height) = canvas.camera, canvas.size
     # All of the image is projected into, so that slopes end where those of the definition do;
     # and a rim around it from which splats may be shifted, as those beyond are left out.

@@ -54,12 +54,12 @@ class ExposurePair:
     """Where both values are neither too dark nor saturated."""
 
     def later(self, by_us: int) -> "ExposurePair":
-        """The same pictures, taken at another time."""
+        """The same images, taken at another time."""
         return ExposurePair(self.frames, self.windows_us + by_us, self.change, self.usable)
 
 
 @dataclass(frozen=True)
-class Told:
+class ReaderOptions:
     """What the events of each site tell of one pair."""
 
     expected: Float64[np.ndarray, "m"]
@@ -120,7 +120,7 @@ def told(
     pair: ExposurePair,
     sites: Int64[np.ndarray, "m"],
     thresholds: tuple[float, float],
-) -> Told:
+) -> ReaderOptions:
     """What the events of some sites tell of a pair.
 
     Args:
@@ -132,7 +132,7 @@ def told(
     """
     found = np.zeros((len(sites), 5))
     _tell(*(sites, index.offset, index.t_us, index.p, weight, pair.windows_us, thresholds, found))
-    return Told(found[:, 0], found[:, 1:3], found[:, 3], found[:, 4])
+    return ReaderOptions(found[:, 0], found[:, 1:3], found[:, 3], found[:, 4])
 
 
 def weights(index: EventIndex, dead_us: float) -> Float64[np.ndarray, "n"]:

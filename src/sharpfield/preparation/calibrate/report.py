@@ -1,4 +1,4 @@
-"""What calibration leaves behind: numbers, a map of the pixels' thresholds, a picture of it."""
+"""What calibration leaves behind: numbers, a map of the pixels' thresholds, a image of it."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from sharpfield.preparation.thresholds import known_thresholds
 from sharpfield.storage.arrays import write_arrays
 from sharpfield.storage.images import write_image
 
-NUMBERS, PIXELS, PICTURE = "calibration.json", "pixels.npz", "pixels.png"
+NUMBERS, PIXELS, IMAGE = "calibration.json", "pixels.npz", "pixels.png"
 
 WIDEST = 0.5
 """Log of the ratio of thresholds that gets the full colour: a factor of about 1.65 either way."""
@@ -37,7 +37,7 @@ def write_calibration(capture: Capture, made: Calibration, out: Path) -> dict[st
                 "hot": made.hot,
             },
         )
-    write_image(out / PICTURE, pixel_picture(made))
+    write_image(out / IMAGE, pixel_image(made))
     return about
 
 
@@ -90,7 +90,7 @@ def as_text(about: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def pixel_picture(made: Calibration) -> UInt8[np.ndarray, "h w 3"]:
+def pixel_image(made: Calibration) -> UInt8[np.ndarray, "h w 3"]:
     """Thresholds as colours: red above the common one, blue below.
 
     Grey pixels are unknown, black ones dead, amber ones hot; those that deviate get a ring.
@@ -98,14 +98,12 @@ def pixel_picture(made: Calibration) -> UInt8[np.ndarray, "h w 3"]:
     strength = np.log(np.where(np.isfinite(made.ratio), made.ratio, 1).clip(0.05, 20)) / WIDEST
     strength = np.clip(strength, -1, 1)[..., None]
     full = np.where(strength > 0, np.array(RED), np.array(BLUE))
-    picture = np.array(WHITE) + np.abs(strength) * (full - np.array(WHITE))
-    picture[~np.isfinite(made.ratio)] = UNKNOWN
-    picture[made.dead] = DEAD
-    picture[made.hot] = HOT
+    image = np.array(WHITE) + np.abs(strength) * (full - np.array(WHITE))
+    image[~np.isfinite(made.ratio)] = UNKNOWN
+    image[made.dead] = DEAD
+    image[made.hot] = HOT
     zoom = 3 if made.ratio.shape[1] < 480 else 1
-    large = np.ascontiguousarray(
-        np.kron(picture, np.ones((zoom, zoom, 1))).round().astype(np.uint8)
-    )
+    large = np.ascontiguousarray(np.kron(image, np.ones((zoom, zoom, 1))).round().astype(np.uint8))
     for y, x in np.argwhere(made.deviating):
         centre = (int(zoom * x + zoom // 2), int(zoom * y + zoom // 2))
         cv2.circle(large, centre, 2 * zoom, (0, 0, 0), 1, cv2.LINE_AA)

@@ -149,8 +149,8 @@ def check_agreement(capture: Capture, checkup: Checkup) -> Agreement | None:
     )
     _say(found, checkup)
     said = _said(capture, index, pairs[:1], 0)[0]
-    checkup.pictures["what the frames say changed between two exposures"] = _signs(seen[0])
-    checkup.pictures["what the events say changed"] = _signs(said)
+    checkup.images["what the frames say changed between two exposures"] = _signs(seen[0])
+    checkup.images["what the events say changed"] = _signs(said)
     return found
 
 

@@ -16,7 +16,7 @@ from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, calibra
 from sharpfield.preparation.doctor.agreement import check_agreement
 from sharpfield.preparation.doctor.events import check_layout, check_light, check_pixels, check_rate
 from sharpfield.preparation.doctor.findings import Checkup
-from sharpfield.preparation.doctor.poses import check_blur, check_motion, check_pictures
+from sharpfield.preparation.doctor.poses import check_blur, check_images, check_motion
 from sharpfield.preparation.doctor.times import check_hold_out, check_poses_known, check_units
 from sharpfield.preparation.thresholds import known_thresholds
 
@@ -54,7 +54,7 @@ def examine(capture: Capture) -> Checkup:
         if aligned:
             check_motion(capture, checkup)
         if capture.frames is not None and len(capture.frames) > 1:
-            _tried(checkup, "poses-fit", lambda: check_pictures(capture, checkup))
+            _tried(checkup, "poses-fit", lambda: check_images(capture, checkup))
             check_blur(capture, checkup)
     elif posed:
         checkup.say("note", "poses-fit", "poses were not judged: mend the errors first")

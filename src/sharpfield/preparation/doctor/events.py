@@ -152,7 +152,7 @@ def check_pixels(capture: Capture, checkup: Checkup) -> None:
     level = np.log1p(count) / max(np.log1p(np.percentile(count, 99.5)), 1e-9)
     shown = np.repeat((255 * np.clip(level, 0, 1)).astype(np.uint8)[..., None], 3, -1)
     shown[dead], shown[hot] = (38, 86, 190), (245, 160, 40)
-    checkup.pictures["events of each pixel (log): dead ones blue, hot ones amber"] = shown
+    checkup.images["events of each pixel (log): dead ones blue, hot ones amber"] = shown
 
 
 def check_light(capture: Capture, checkup: Checkup) -> None:

@@ -42,7 +42,7 @@ class Checkup:
 
     name: str
     findings: list[Finding] = field(default_factory=list[Finding])
-    pictures: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
+    images: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
     """By caption."""
     curves: list[Curve] = field(default_factory=list[Curve])
 

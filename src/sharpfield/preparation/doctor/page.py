@@ -10,14 +10,14 @@ from sharpfield.core.files import replacing
 from sharpfield.preparation.doctor.findings import Checkup, Curve, Finding
 from sharpfield.report import page
 from sharpfield.report.capture import captured
-from sharpfield.report.page import Look, Picture, section
+from sharpfield.report.page import Image, Look, section
 
 LOOK = Look(900, 82)
 INK = {"error": "#c2281a", "warning": "#b8801f", "note": "#5f6b7a"}
 WIDTH, HEIGHT, MARGIN = 300, 170, 40
 """Of a drawing, and the room for its numbers."""
 WIDE = 1.9
-"""Width over height from which on a picture gets a row of its own."""
+"""Width over height from which on a image gets a row of its own."""
 
 
 def write_page(path: Path, checkup: Checkup, capture: Capture | None) -> None:
@@ -31,7 +31,7 @@ def write_page(path: Path, checkup: Checkup, capture: Capture | None) -> None:
     parts = [
         _header(checkup),
         section("Findings", "\n".join(_finding(one) for one in checkup.sorted)),
-        section("What was seen", _pictures(checkup)),
+        section("What was seen", _images(checkup)),
         section("What was tried", _curves(checkup)),
         captured(capture, LOOK) if capture is not None else "",
     ]
@@ -73,14 +73,14 @@ def _finding(one: Finding) -> str:
     return f'<div class="note" style="border-color:{colour}">{"".join(lines)}</div>'
 
 
-def _pictures(checkup: Checkup) -> str:
+def _images(checkup: Checkup) -> str:
     figures = [
         page.figure(
-            Picture("evidence", np.ascontiguousarray(pixels), caption, caption.capitalize()), LOOK
+            Image("evidence", np.ascontiguousarray(pixels), caption, caption.capitalize()), LOOK
         )
-        for caption, pixels in checkup.pictures.items()
+        for caption, pixels in checkup.images.items()
     ]
-    wide = [pixels.shape[1] > WIDE * pixels.shape[0] for pixels in checkup.pictures.values()]
+    wide = [pixels.shape[1] > WIDE * pixels.shape[0] for pixels in checkup.images.values()]
     small = "".join(one for one, alone in zip(figures, wide, strict=True) if not alone)
     large = "".join(one for one, alone in zip(figures, wide, strict=True) if alone)
     return f'<div class="row">{small}</div>{large}' if figures else ""

@@ -1,6 +1,6 @@
-"""Do the poses fit the pictures, and the motion they tell of the events?
+"""Do the poses fit the images, and the motion they tell of the events?
 
-Details that two pictures share must lie on the lines that poses and focal length say, whatever
+Details that two images share must lie on the lines that poses and focal length say, whatever
 their depth. The focal length is tried at other values: if another one fits clearly better, it is
 wrong. And where poses move the image fast, many events must come.
 """
@@ -18,9 +18,9 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.geometry.two_views import PairMatches, find_details, match_pairs, sampson_px
 from sharpfield.preparation.doctor.findings import Checkup, Curve
-from sharpfield.preparation.poses.images import Sharp, sharp_pictures
+from sharpfield.preparation.poses.images import Sharp, sharp_images
 
-MOST_PICTURES = 8
+MOST_IMAGES = 8
 LEAST_DETAILS = 60
 """Matches over all pairs; fewer do not judge."""
 FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 33))
@@ -38,15 +38,15 @@ BLUR_SHARE = 0.15
 """Blur, as a share of the width, beyond which little can be saved."""
 
 
-def check_pictures(capture: Capture, checkup: Checkup) -> None:
+def check_images(capture: Capture, checkup: Checkup) -> None:
     """Matched details of frames, against poses and focal length."""
     frames = capture.needed_frames
-    chosen = evenly_spread(np.arange(len(frames)), MOST_PICTURES)
-    sharp = sharp_pictures(capture, "auto")
+    chosen = evenly_spread(np.arange(len(frames)), MOST_IMAGES)
+    sharp = sharp_images(capture, "auto")
     rows = np.flatnonzero(np.isin(sharp.frame, chosen))
     poses = _poses(capture, sharp)[rows]
     pairs = [(i, j) for i in range(len(rows)) for j in range(i + 1, len(rows))]
-    matches = match_pairs(find_details(sharp.pictures[rows]), pairs)
+    matches = match_pairs(find_details(sharp.images[rows]), pairs)
     count = sum(len(one) for one in matches)
     if count < LEAST_DETAILS:
         checkup.say(
@@ -69,9 +69,9 @@ def check_pictures(capture: Capture, checkup: Checkup) -> None:
             errors,
         )
     )
-    checkup.pictures[
-        "details that two frames share: green on the lines that poses say, else red"
-    ] = _lines(sharp.pictures[rows], max(matches, key=len), capture.camera, poses)
+    checkup.images["details that two frames share: green on the lines that poses say, else red"] = (
+        _lines(sharp.images[rows], max(matches, key=len), capture.camera, poses)
+    )
     got = f"median {given:.2f} px from the lines, {count} details of {len(matches)} pairs"
     off = abs(np.log(FACTORS[best])) > OFF_BY
     if given > FINE_PX and off and errors[best] < GAIN * given and errors[best] < POOR_PX:
@@ -79,7 +79,7 @@ def check_pictures(capture: Capture, checkup: Checkup) -> None:
         checkup.say(
             "warning" if unknown else "error",
             "focal-length",
-            "the focal length does not fit the pictures and poses",
+            "the focal length does not fit the images and poses",
             got=f"{focal:.1f} px leaves {given:.2f} px; {FACTORS[best] * focal:.0f} px would leave"
             f" {errors[best]:.2f} px",
             do="give the intrinsics for this image size, or find them with"
@@ -89,13 +89,13 @@ def check_pictures(capture: Capture, checkup: Checkup) -> None:
         checkup.say(
             "error",
             "poses-disagree",
-            "the poses do not fit the pictures",
+            "the poses do not fit the images",
             got=got,
             do="check axes (OpenCV, world from camera), the clock and the hand-eye transform, or"
             " find the poses with `sharpfield poses`",
         )
     else:
-        checkup.say("note", "poses-fit", "poses and focal length fit the pictures", got=got)
+        checkup.say("note", "poses-fit", "poses and focal length fit the images", got=got)
 
 
 def check_motion(capture: Capture, checkup: Checkup) -> None:
@@ -204,13 +204,13 @@ def _error(
 
 
 def _lines(
-    pictures: np.ndarray,
+    images: np.ndarray,
     matches: PairMatches,
     camera: Camera,
     poses: Float64[np.ndarray, "n 3 4"],
 ) -> np.ndarray:
-    """Two pictures side by side; each detail in the colour of its distance from the line."""
-    both = [np.broadcast_to(pictures[i], (*pictures[i].shape[:2], 3)) for i in matches.pair]
+    """Two images side by side; each detail in the colour of its distance from the line."""
+    both = [np.broadcast_to(images[i], (*images[i].shape[:2], 3)) for i in matches.pair]
     shown = np.ascontiguousarray(np.concatenate(both, 1))
     off = sampson_px(matches, camera, poses)
     zoom = 2 if shown.shape[1] < 960 else 1

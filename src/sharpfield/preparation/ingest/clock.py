@@ -2,7 +2,7 @@
 
 Two cameras each have a clock. Where the one that takes frames tells the other when its shutter
 opens and closes, by a wire, *triggers* say it exactly. Otherwise the *offset* of one clock to the
-other is found by what both see: pictures change most from one to the next when most events happen.
+other is found by what both see: images change most from one to the next when most events happen.
 That works where motion is uneven, and says nothing where it is steady, so the result comes with
 its certainty.
 """
@@ -41,7 +41,7 @@ class Offset:
 
     offset_us: int
     correlation: float
-    """Of the change of pictures with the number of events, at this offset."""
+    """Of the change of images with the number of events, at this offset."""
     runner_up: float
     """The same of the best offset that does not lie on the same hill."""
     within_us: int
@@ -132,11 +132,11 @@ def find_offset(
     per_ms: Int64[np.ndarray, "k"],
     origin_us: int,
 ) -> Offset:
-    """The offset at which pictures change as much as there are events.
+    """The offset at which images change as much as there are events.
 
     Args:
-        change: How much each picture differs from the one before it; one fewer than pictures.
-        middles_us: When each picture was exposed, on the frames' clock.
+        change: How much each image differs from the one before it; one fewer than images.
+        middles_us: When each image was exposed, on the frames' clock.
         per_ms: Events in each ms.
         origin_us: Where `per_ms` begins, on the events' clock.
 
@@ -183,7 +183,7 @@ def find_offset(
     )
 
 
-def believed(offset: Offset, where: object) -> int:
+def accepted_offset(offset: Offset, where: object) -> int:
     """The offset in us, if it is certain; 0 if the clocks may as well be the same.
 
     Raises:

@@ -19,13 +19,13 @@ from sharpfield.recordings.recording import Frame
 from sharpfield.storage.images import write_image
 
 SMALL = 64
-"""Width in pixels of the pictures whose change is measured."""
+"""Width in pixels of the images whose change is measured."""
 FLOOR = 1 / 255
 """Light below which no logarithm is taken."""
 
 
 @dataclass(frozen=True)
-class Taken:
+class WrittenFrames:
     """The frames that were written."""
 
     names: tuple[str, ...]
@@ -33,13 +33,13 @@ class Taken:
     open_us: Int64[np.ndarray, "n"]
     close_us: Int64[np.ndarray, "n"]
     change: Float64[np.ndarray, "m"]
-    """Mean absolute change of log light from each picture to the next."""
+    """Mean absolute change of log light from each image to the next."""
     shape: tuple[int, int, int]
     bits: int
 
     def picked(self, keep: Shaped[np.ndarray, "n"]) -> "Taken":
         """Some of the frames; changes are dropped."""
-        return Taken(
+        return WrittenFrames(
             tuple(name for name, kept in zip(self.names, keep, strict=True) if kept),
             self.open_us[keep],
             self.close_us[keep],
@@ -49,20 +49,20 @@ class Taken:
         )
 
 
-def take_frames(
+def write_frames_of(
     frames: Iterator[Frame],
     folder: Path,
     lens: Geometry,
     bayer: str,
     heard: Callable[[int], None],
-) -> Taken:
+) -> WrittenFrames:
     """Write all frames to a folder; those that are there already are left as they are.
 
     Args:
         frames: In the order of time.
-        folder: Of the pictures.
-        lens: How pictures come to the capture's pixels.
-        bayer: Filter tile of the sensor, where pictures are raw.
+        folder: Of the images.
+        lens: How images come to the capture's pixels.
+        bayer: Filter tile of the sensor, where images are raw.
         heard: Is told how many were written.
 
     Raises:
@@ -76,22 +76,22 @@ def take_frames(
     shape: tuple[int, int, int] | None = None
     bits = 8
     for number, frame in enumerate(frames):
-        picture = lens.picture(frame.image, bayer)
-        bits = 8 * picture.dtype.itemsize
-        if shape is not None and picture.shape != shape:
+        image = lens.image(frame.image, bayer)
+        bits = 8 * image.dtype.itemsize
+        if shape is not None and image.shape != shape:
             raise CaptureError(
                 "frames differ in size or colour",
                 where=f"frame {frame.name or number}",
-                got=f"{picture.shape} after {shape}",
+                got=f"{image.shape} after {shape}",
                 do="record with one setting of the camera",
             )
-        shape = picture.shape[0], picture.shape[1], picture.shape[2]
+        shape = image.shape[0], image.shape[1], image.shape[2]
         names.append(_name(frame.name, number, known))
         times.append((frame.open_us, frame.close_us))
         file = folder / f"{names[-1]}.png"
         if not file.exists():
-            write_image(file, picture)
-        small = _log_small(picture)
+            write_image(file, image)
+        small = _log_small(image)
         if before is not None:
             change.append(float(np.abs(small - before).mean()))
         before = small
@@ -99,10 +99,10 @@ def take_frames(
     if shape is None:
         raise CaptureError("the recording holds no frames", where=folder)
     opens, closes = np.array(times, np.int64).T
-    return Taken(tuple(names), opens, closes, np.array(change), shape, bits)
+    return WrittenFrames(tuple(names), opens, closes, np.array(change), shape, bits)
 
 
-def remember(taken: Taken, path: Path) -> None:
+def save_frames(taken: WrittenFrames, path: Path) -> None:
     """Write down which frames were taken, when all of them were."""
     about: dict[str, Any] = {
         "names": taken.names,
@@ -115,11 +115,11 @@ def remember(taken: Taken, path: Path) -> None:
     write_json(path, about)
 
 
-def recalled(path: Path) -> Taken:
-    """What `remember` wrote."""
+def load_frames(path: Path) -> WrittenFrames:
+    """What `save_frames` wrote."""
     about = json.loads(path.read_text())
     height, width, channels = about["shape"]
-    return Taken(
+    return WrittenFrames(
         tuple(about["names"]),
         np.array(about["open_us"], np.int64),
         np.array(about["close_us"], np.int64),
@@ -140,10 +140,10 @@ def _name(own: str, number: int, known: set[str]) -> str:
     return f"frame_{number:06d}"
 
 
-def _log_small(picture: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "y x"]:
-    """The logarithm of what a picture looks like from afar."""
-    height, width = picture.shape[:2]
-    grey = picture.mean(-1, dtype=np.float32) / np.iinfo(picture.dtype).max
+def _log_small(image: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "y x"]:
+    """The logarithm of what a image looks like from afar."""
+    height, width = image.shape[:2]
+    grey = image.mean(-1, dtype=np.float32) / np.iinfo(image.dtype).max
     scale = min(SMALL / width, 1.0)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)

@@ -23,15 +23,20 @@ from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import Stamped, Still
 from sharpfield.preparation.ingest.clock import (
-    believed,
+    accepted_offset,
     find_offset,
     shifted,
     triggered,
     with_length,
 )
-from sharpfield.preparation.ingest.frames import Taken, recalled, remember, take_frames
+from sharpfield.preparation.ingest.frames import (
+    WrittenFrames,
+    load_frames,
+    save_frames,
+    write_frames_of,
+)
 from sharpfield.preparation.ingest.lens import DEMOSAIC, Geometry, geometry, no_events
-from sharpfield.preparation.ingest.options import Choices, roles
+from sharpfield.preparation.ingest.options import IngestOptions, roles
 from sharpfield.preparation.ingest.stage import Stage, fingerprint, plain
 from sharpfield.preparation.ingest.survey import Sieve, Survey, hot_pixels, survey
 from sharpfield.recordings.recording import Recording
@@ -60,7 +65,9 @@ class Ingested:
     """What nobody knows yet."""
 
 
-def ingest(recordings: tuple[Recording, ...], out: Path, choices: Choices, tell: Tell) -> Ingested:
+def ingest(
+    recordings: tuple[Recording, ...], out: Path, choices: IngestOptions, tell: Tell
+) -> Ingested:
     """Make a capture of one recording, or of two that were taken together.
 
     Args:
@@ -91,7 +98,7 @@ class _Ingest:
         self,
         events: Recording | None,
         frames: Recording | None,
-        choices: Choices,
+        choices: IngestOptions,
         stage: Stage,
         tell: Tell,
     ) -> None:
@@ -127,7 +134,7 @@ class _Ingest:
         )
 
     def _survey(self) -> Survey:
-        known = self._stage.recalled()
+        known = self._stage.load_frames()
         if known is not None:
             return known
         assert self._events is not None
@@ -145,7 +152,7 @@ class _Ingest:
         )
         if not found.count:
             raise CaptureError("the recording holds no events", where=self._events.path)
-        self._stage.remember(found)
+        self._stage.save_frames(found)
         self._heed(self._events)
         return found
 
@@ -159,18 +166,18 @@ class _Ingest:
         sensor = None if self._events is None else self._events.size
         return geometry(sensor, frame_size, self._choices.optics, self._where)
 
-    def _take(self, lens: Geometry) -> Taken:
+    def _take(self, lens: Geometry) -> WrittenFrames:
         if self._stage.frames.is_file():
-            return recalled(self._stage.frames)
+            return load_frames(self._stage.frames)
         assert self._frames is not None and self._frames.frames is not None
-        taken = take_frames(
+        taken = write_frames_of(
             self._frames.frames(),
             self._stage.capture / "frames",
             lens,
             self._bayer(self._frames),
             lambda count: self._tell("writing frames", count, None),
         )
-        remember(taken, self._stage.frames)
+        save_frames(taken, self._stage.frames)
         self._heed(self._frames)
         return taken
 
@@ -183,13 +190,13 @@ class _Ingest:
         return recording.bayer if given is None else given.replace("none", "")
 
     def _event_bayer(self, lens: Geometry) -> str:
-        """The filter before the event sensor; pictures of another sensor say nothing about it."""
+        """The filter before the event sensor; images of another sensor say nothing about it."""
         assert self._events is not None
         if self._choices.scene.bayer is None and lens.separate:
             return ""
         return self._bayer(self._events)
 
-    def _exposure(self, taken: Taken, found: Survey | None) -> tuple[Exposure, str]:
+    def _exposure(self, taken: WrittenFrames, found: Survey | None) -> tuple[Exposure, str]:
         """When frames were exposed, on the clock of the events; and how that is known."""
         timing = self._choices.timing
         exposure = Exposure(taken.open_us, taken.close_us)
@@ -213,7 +220,9 @@ class _Ingest:
         if timing.clock == "triggers":
             raise CaptureError("the recording holds no triggers", where=self._where)
         offset = find_offset(taken.change, exposure.middle_us, found.per_ms, found.origin_us)
-        return shifted(exposure, believed(offset, self._where)), f"frames came later by {offset}"
+        return shifted(
+            exposure, accepted_offset(offset, self._where)
+        ), f"frames came later by {offset}"
 
     def _span(self, found: Survey | None, exposure: Exposure | None) -> tuple[int, int]:
         """First and last time of the capture."""
@@ -279,8 +288,8 @@ class _Ingest:
             self._left[kind] = max(self._left.get(kind, 0), count)
 
     def _crop(
-        self, taken: Taken, exposure: Exposure, span: tuple[int, int]
-    ) -> tuple[Taken, Exposure, dict[str, int]]:
+        self, taken: WrittenFrames, exposure: Exposure, span: tuple[int, int]
+    ) -> tuple[WrittenFrames, Exposure, dict[str, int]]:
         """The frames whose exposures lie in the time to keep, and while the poses are known."""
         inside = (exposure.open_us >= span[0]) & (exposure.close_us <= span[1])
         posed = np.ones(len(exposure), bool)
@@ -315,7 +324,7 @@ class _Ingest:
         self,
         name: str,
         lens: Geometry,
-        taken: Taken | None,
+        taken: WrittenFrames | None,
         exposure: Exposure | None,
         span: tuple[int, int],
     ) -> Capture:
@@ -375,7 +384,7 @@ class _Ingest:
         told = {} if self._events is None else self._events.notes
         return notes | {k: float(v) for k, v in told.items() if k.startswith("threshold_")}
 
-    def _seal(self, capture: Capture, taken: Taken | None) -> None:
+    def _seal(self, capture: Capture, taken: WrittenFrames | None) -> None:
         """Write the description, and let the capture take its place."""
         tables = None
         if taken is not None and capture.frames is not None:

@@ -1,4 +1,4 @@
-"""Which camera a recording becomes, and what has to be done to its pictures for that.
+"""Which camera a recording becomes, and what has to be done to its images for that.
 
 A capture has one camera: events and frames share its pixels. Where one lens serves both, nothing
 is resampled: the lens is told by the camera's model. *Rectified* captures have an ideal lens
@@ -52,23 +52,21 @@ class Optics:
 
 @dataclass(frozen=True)
 class Geometry:
-    """The camera of a capture, and how pictures and events come to its pixels."""
+    """The camera of a capture, and how images and events come to its pixels."""
 
     camera: Camera
     frame_map: Float32[np.ndarray, "h w 2"] | None = None
-    """Where each pixel lies in the recorded picture; None if pictures stay as they are."""
+    """Where each pixel lies in the recorded image; None if images stay as they are."""
     frame_size: Size | None = None
-    """To scale pictures to."""
+    """To scale images to."""
     sites: Float32[np.ndarray, "h w 2"] | None = None
     """Position of each pixel of the event sensor; None if events keep their pixels."""
     separate: bool = False
     """Whether frames come from another sensor than events."""
     notes: dict[str, str | float] = field(default_factory=dict[str, str | float])
 
-    def picture(
-        self, image: Shaped[np.ndarray, "y x *c"], bayer: str
-    ) -> Shaped[np.ndarray, "h w d"]:
-        """A recorded picture on the capture's pixels; of a colour sensor, with its colours."""
+    def image(self, image: Shaped[np.ndarray, "y x *c"], bayer: str) -> Shaped[np.ndarray, "h w d"]:
+        """A recorded image on the capture's pixels; of a colour sensor, with its colours."""
         if bayer and image.ndim == 2:
             image = cv2.cvtColor(image, DEMOSAIC[bayer])
         if self.frame_map is not None:
@@ -103,7 +101,7 @@ def geometry(events: Size | None, frames: Size | None, optics: Optics, where: ob
 
     Args:
         events: Size of the event sensor, if there are events.
-        frames: Size of the recorded pictures, if there are any.
+        frames: Size of the recorded images, if there are any.
         optics: What is known of the lenses.
         where: The recording, for messages.
 

@@ -68,14 +68,14 @@ class Scene:
     """Farthest."""
     encoding: str | None = None
     """How stored values of frames relate to light: linear, gamma2.2 or srgb. By default srgb for
-    videos and pictures, linear for raw colour, else gamma2.2."""
+    videos and images, linear for raw colour, else gamma2.2."""
     bayer: str | None = None
     """Colour filter tile of the sensor, where the recording does not say: RGGB, GRBG, GBRG, BGGR;
     or `none`."""
 
 
 @dataclass(frozen=True)
-class Choices:
+class IngestOptions:
     """Everything that can be chosen."""
 
     optics: Optics = field(default_factory=Optics)
@@ -109,7 +109,7 @@ def roles(
 
 
 @dataclass(frozen=True)
-class Mistakes:
+class AxisFixes:
     """What is wrong with the events of a recording."""
 
     swap_xy: bool = False
@@ -132,7 +132,7 @@ class Mistakes:
         return ", ".join(word for word, wrong in words.items() if wrong)
 
 
-def mended(recording: Recording, mistakes: Mistakes) -> Recording:
+def fixed_axes(recording: Recording, mistakes: AxisFixes) -> Recording:
     """The same recording without the mistakes; its frames are as they were.
 
     The size of a recording whose axes are exchanged is taken to be exchanged as well.
@@ -150,7 +150,7 @@ def mended(recording: Recording, mistakes: Mistakes) -> Recording:
     return replace(recording, events=events, size=size, layout=layout)
 
 
-def _mended(events: EventStream, mistakes: Mistakes) -> EventStream:
+def _mended(events: EventStream, mistakes: AxisFixes) -> EventStream:
     x, y, width, height = events.x, events.y, events.width, events.height
     if mistakes.swap_xy:
         x, y, width, height = y, x, height, width

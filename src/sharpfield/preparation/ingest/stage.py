@@ -75,7 +75,7 @@ class Stage:
         """Where it is told what became of the events."""
         return self.folder / "events.json"
 
-    def remember(self, survey: Survey) -> None:
+    def save_frames(self, survey: Survey) -> None:
         """Keep the first look."""
         with replacing(self.folder / "survey.npz") as temporary:
             write_arrays(
@@ -83,7 +83,7 @@ class Stage:
                 {name: np.asarray(value) for name, value in vars(survey).items()},
             )
 
-    def recalled(self) -> Survey | None:
+    def load_frames(self) -> Survey | None:
         """The first look, if there was one."""
         path = self.folder / "survey.npz"
         if not path.is_file():

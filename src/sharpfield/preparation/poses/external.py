@@ -20,7 +20,7 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.geometry.two_views import depths_of, find_details, match_pairs, pairs_apart
 from sharpfield.preparation.poses.find import split_of, within
-from sharpfield.preparation.poses.images import sharp_pictures
+from sharpfield.preparation.poses.images import sharp_images
 from sharpfield.preparation.poses.path import Laid, frames_of, path_through
 from sharpfield.preparation.poses.world import Known
 
@@ -218,13 +218,13 @@ def _seen_bounds(capture: Capture) -> tuple[float, float]:
     )
     if capture.frames is None:
         raise unknown
-    sharp = sharp_pictures(capture, "auto")
+    sharp = sharp_images(capture, "auto")
     time = torch.from_numpy(capture.clock.unit(sharp.time_us))
     track = torch.from_numpy(capture.frames.track[sharp.frame])
     poses = capture.trajectory.pose(time, track).detach().double().numpy()
     pairs = pairs_apart(poses, most=PAIRS)
     found = []
-    for matches in match_pairs(find_details(sharp.pictures), pairs):
+    for matches in match_pairs(find_details(sharp.images), pairs):
         depth, sure = depths_of(matches, capture.camera, poses)
         found += depth[sure].tolist()
     if not found:

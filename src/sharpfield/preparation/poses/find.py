@@ -1,6 +1,6 @@
 """Find the poses of a capture from its own frames, sharpened by its events where there are any.
 
-    sharp pictures  ->  map of points and poses  ->  a world of its own  ->  a path through time
+    sharp images  ->  map of points and poses  ->  a world of its own  ->  a path through time
 
 Frames whose pose was not found but that lie between others stay in the capture, on the path, and
 are neither learned from nor held out; frames beyond the path's ends are left out, and so are
@@ -20,7 +20,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.geometry.space import Similarity
 from sharpfield.geometry.trajectory import Stamped, Still, Tracks
 from sharpfield.preparation.poses.find_checks import Relief, relief
-from sharpfield.preparation.poses.images import Sharp, Source, sharp_pictures
+from sharpfield.preparation.poses.images import Sharp, Source, sharp_images
 from sharpfield.preparation.poses.mapping import (
     LEAST_FEATURES,
     LEAST_MATCHES,
@@ -29,22 +29,22 @@ from sharpfield.preparation.poses.mapping import (
     LensTask,
     Map,
     Seen,
-    map_pictures,
+    map_images,
 )
 from sharpfield.preparation.poses.path import Laid, path_through
 from sharpfield.preparation.poses.world import Known, depths, known_world, measured_world, own_world
 
-INSTANTS, MOST_PICTURES = 3, 120
-"""Pictures taken from each exposure, as long as there are not more in all."""
+INSTANTS, MOST_IMAGES = 3, 120
+"""Images taken from each exposure, as long as there are not more in all."""
 
 LEAST_SHARE = 0.5
-"""Share of the pictures that must be found for the result to be worth writing."""
+"""Share of the images that must be found for the result to be worth writing."""
 
 FLAT = 0.9
 """Share of pairs explained by a plane, from which on the scene or the motion is said to be flat."""
 
 ERROR_PX, VIEWS = 1.5, 3
-"""A point of the cloud is seen no farther than this from where it projects, in so many pictures."""
+"""A point of the cloud is seen no farther than this from where it projects, in so many images."""
 
 BOUNDS_PERCENT = (0.5, 99.5)
 BOUNDS_MARGIN = 1.1
@@ -59,12 +59,12 @@ KnownAt = Callable[[Int64[np.ndarray, "n"]], Known]
 class PoseOptions:
     """How poses are found."""
 
-    pictures: Source = "auto"
+    images: Source = "auto"
     """`edi`: frames deblurred with their events. `frames`: as they are. `sharpest`: only the
     sharpest of each three neighbours. `auto`: `edi` where there are events and exposures."""
     instants: int | None = None
-    """Pictures taken from each exposure, with `edi`; more make the path finer, and take longer.
-    By default three, or fewer where that would be more than 120 pictures."""
+    """Images taken from each exposure, with `edi`; more make the path finer, and take longer.
+    By default three, or fewer where that would be more than 120 images."""
     intrinsics: Intrinsics | None = None
     """`given` keeps the camera, `refine` starts from its focal length, `find` knows nothing; by
     default `given`, or `find` where the capture does not know its focal length."""
@@ -76,9 +76,9 @@ class PoseOptions:
 
 @dataclass(frozen=True)
 class Failure:
-    """A picture without a pose."""
+    """A image without a pose."""
 
-    picture: int
+    image: int
     why: str
     do: str
 
@@ -97,7 +97,7 @@ class PosesFound:
     """Which frames of the original capture are in the new one."""
     intrinsics: Intrinsics
     relief: Relief | None
-    """How much depth the pictures show; None if they share too little to say."""
+    """How much depth the images show; None if they share too little to say."""
     off_known: float | None = None
     """Root mean square distance of camera centres from known ones."""
 
@@ -109,19 +109,19 @@ def find_poses(
 
     Args:
         capture: With frames. Poses it has are not looked at.
-        options: Pictures, lens.
+        options: Images, lens.
         known: Says poses at some times of the capture, and thereby what the world is.
 
     Raises:
         CaptureError: Poses could not be found; the message says why and what to try.
         MissingExtra: pycolmap is not installed.
     """
-    sharp = sharp_pictures(
-        capture, options.pictures, instants=options.instants or _instants(capture, options.pictures)
+    sharp = sharp_images(
+        capture, options.images, instants=options.instants or _instants(capture, options.images)
     )
     intrinsics = options.intrinsics or _usual(capture)
     task = LensTask(capture.camera, intrinsics, options.lens)
-    found, seen = map_pictures(sharp.pictures, task, seed=options.seed)
+    found, seen = map_images(sharp.images, task, seed=options.seed)
     if found is None or found.registered.sum() < max(3, LEAST_SHARE * len(sharp)):
         raise _hopeless(capture, sharp, found, seen)
     off = None
@@ -160,11 +160,11 @@ def within(events: EventStream, path: Stamped | Still | Tracks, laid: Laid) -> E
 
 
 def _instants(capture: Capture, source: Source) -> int:
-    """Pictures to take from each exposure: the motion during long ones is no straight line."""
+    """Images to take from each exposure: the motion during long ones is no straight line."""
     blurred = int((~capture.needed_frames.exposure.instant).sum())
     if capture.events is None or not blurred or source not in ("auto", "edi"):
         return 1
-    return max(min(INSTANTS, MOST_PICTURES // blurred), 1)
+    return max(min(INSTANTS, MOST_IMAGES // blurred), 1)
 
 
 def _usual(capture: Capture) -> Intrinsics:
@@ -221,25 +221,25 @@ def split_of(split: Split, kept: Int64[np.ndarray, "m"], unsure: Int64[np.ndarra
     )
 
 
-def _why(picture: int, sharp: Sharp, seen: Seen) -> tuple[str, str]:
-    """Why a picture has no pose, and what to try."""
-    features, matches = int(seen.features[picture]), int(seen.matches[picture])
+def _why(image: int, sharp: Sharp, seen: Seen) -> tuple[str, str]:
+    """Why a image has no pose, and what to try."""
+    features, matches = int(seen.features[image]), int(seen.matches[image])
     if features < LEAST_FEATURES:
         why = f"only {features} features: it is dark, blurred or has little texture"
         do = (
-            "use the events: --pictures edi"
+            "use the events: --images edi"
             if sharp.source != "edi"
             else "check the thresholds with `sharpfield calibrate`, or leave the frame out"
         )
         return why, do
     if matches < LEAST_MATCHES:
         return (
-            f"{features} features, but no other picture shows the same",
-            "take pictures closer together, --instants 3, or leave the frame out",
+            f"{features} features, but no other image shows the same",
+            "take images closer together, --instants 3, or leave the frame out",
         )
     return (
         f"{matches} matches, but too few of them are points of the map",
-        "take more pictures around it, or --instants 3",
+        "take more images around it, or --instants 3",
     )
 
 
@@ -248,17 +248,17 @@ def _hopeless(capture: Capture, sharp: Sharp, found: Map | None, seen: Seen) -> 
     count = 0 if found is None else int(found.registered.sum())
     features, matches = np.median(seen.features), np.median(seen.matches)
     got = (
-        f"{count} of {len(sharp)} pictures found; the median picture has {features:.0f} features"
+        f"{count} of {len(sharp)} images found; the median image has {features:.0f} features"
         f" and {matches:.0f} matches"
     )
     tries = []
     if sharp.source != "edi" and capture.events is not None:
-        tries.append("deblur with the events first (--pictures edi)")
+        tries.append("deblur with the events first (--images edi)")
     if features < LEAST_FEATURES:
-        why = "the pictures have too few features: dark, blurred or without texture"
+        why = "the images have too few features: dark, blurred or without texture"
         tries.append("light the scene, shorten the exposure, or put texture into view")
     elif matches < LEAST_MATCHES:
-        why = "the pictures have too little in common"
+        why = "the images have too little in common"
         tries.append("take them closer together, or several per exposure (--instants 3)")
     elif seen.flat_pairs > FLAT:
         why = "a plane, or turning on the spot, explains all matches, so depth stays open"

@@ -1,9 +1,9 @@
-"""Whether pictures show enough depth to tell where they were taken from.
+"""Whether images show enough depth to tell where they were taken from.
 
 Before a plane, moving sideways and turning look nearly alike, and so do a long lens from afar and a
-short one from nearby. A map of such a scene fits its pictures well, and is still wrong. *Relief* is
-what tells them apart: how much of what two pictures far apart both show departs from the plane that
-explains most of it, by more than pictures are exact.
+short one from nearby. A map of such a scene fits its images well, and is still wrong. *Relief* is
+what tells them apart: how much of what two images far apart both show departs from the plane that
+explains most of it, by more than images are exact.
 
 Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 11.9 and 13.
 """
@@ -21,7 +21,7 @@ PAIRS = 12
 FAR = 0.75
 """Of pairs that share points, those are looked at that are farther apart than this share of all."""
 SHARED, VIEWS = 20, 3
-"""Two pictures must share so many points, each seen in so many pictures."""
+"""Two images must share so many points, each seen in so many images."""
 TOLERANCE, LEAST_PX = 3.0, 1.0
 """A point departs from a plane from so many times the map's error on, and from so many px."""
 LEAST_OFF = 0.1
@@ -33,13 +33,13 @@ class Relief:
     """How far the map is from a plane."""
 
     off_plane: float
-    """Share of what two pictures show that a plane does not explain; the median over pairs."""
+    """Share of what two images show that a plane does not explain; the median over pairs."""
     tolerance_px: float
     """To within how many px it has to explain it."""
     thickness: float
     """Median distance of points from the plane that fits them best, over their median depth."""
     pairs: int
-    """Of pictures far apart that were looked at."""
+    """Of images far apart that were looked at."""
 
     @property
     def flat(self) -> bool:
@@ -64,7 +64,7 @@ def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | No
         return None
     lens = intrinsics != "given"
     said = (
-        f"the scene is nearly flat: in pictures far apart a plane explains"
+        f"the scene is nearly flat: in images far apart a plane explains"
         f" {100 * (1 - shown.off_plane):.0f} % of the points to {shown.tolerance_px:.1f} px, and"
         f" half of them lie within {100 * shown.thickness:.1f} % of their depth from one plane;"
         f" camera places{' and the focal length' if lens else ''} may be off by a tenth"
@@ -77,7 +77,7 @@ def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | No
 
 
 def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
-    """Pairs of pictures that share points and are far from each other, and those points."""
+    """Pairs of images that share points and are far from each other, and those points."""
     view, point = found.sightings.T
     good = found.track_length[point] >= VIEWS
     shape = len(found.poses), len(found.points)
@@ -97,7 +97,7 @@ def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]
 def _off_plane(
     found: Map, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
 ) -> float:
-    """Share of points whose places in two pictures the best homography does not relate."""
+    """Share of points whose places in two images the best homography does not relate."""
     first, second = (_ideal_px(found, i, rows) for i in (one, two))
     cv2.setRNGSeed(0)
     _, explained = cv2.findHomography(first, second, cv2.RANSAC, tolerance_px)
@@ -105,7 +105,7 @@ def _off_plane(
 
 
 def _ideal_px(found: Map, view: int, rows: Int64[np.ndarray, "m"]) -> Float64[np.ndarray, "m 2"]:
-    """Where a picture of an ideal lens shows points of the map."""
+    """Where a image of an ideal lens shows points of the map."""
     pose = found.poses[view]
     local = (found.points[rows] - pose[:, 3]) @ pose[:, :3]
     return found.camera.fx_px * local[:, :2] / local[:, 2:]

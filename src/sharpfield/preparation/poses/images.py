@@ -1,4 +1,4 @@
-"""Pictures that poses can be found from: as sharp as the capture allows, each at an instant."""
+"""Images that poses can be found from: as sharp as the capture allows, each at an instant."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -21,10 +21,10 @@ NEIGHBOURHOOD = 3
 
 @dataclass(frozen=True)
 class Sharp:
-    """Pictures, and the instants they show."""
+    """Images, and the instants they show."""
 
     source: Literal["edi", "frames", "sharpest"]
-    pictures: UInt8[np.ndarray, "n h w c"]
+    images: UInt8[np.ndarray, "n h w c"]
     """Display-referred."""
     frame: Int64[np.ndarray, "n"]
     """The frame of the capture that each one came from."""
@@ -34,22 +34,22 @@ class Sharp:
 
     def __len__(self) -> int:
         """How many there are."""
-        return len(self.pictures)
+        return len(self.images)
 
     def names(self) -> list[str]:
         """A file name for each, sorted as they are."""
         return [f"{i:06d}.png" for i in range(len(self))]
 
 
-def sharp_pictures(capture: Capture, source: Source, *, instants: int = 1) -> Sharp:
-    """Pictures of all frames, sorted by track and time.
+def sharp_images(capture: Capture, source: Source, *, instants: int = 1) -> Sharp:
+    """Images of all frames, sorted by track and time.
 
     Args:
         capture: With frames; its poses are not looked at.
         source: `edi` takes blurred frames apart with their events. `frames` takes them as they
             are, at the middle of the exposure, and `sharpest` only the sharpest of its
             neighbours. `auto` is `edi` where there are events and exposures.
-        instants: Pictures of each exposure; more than one only with `edi`.
+        instants: Images of each exposure; more than one only with `edi`.
 
     Raises:
         CaptureError: There are no frames, or no events where they are needed.
@@ -63,7 +63,7 @@ def sharp_pictures(capture: Capture, source: Source, *, instants: int = 1) -> Sh
         raise OptionError(
             "only events tell several instants of one exposure apart",
             got=f"{instants} instants from {source}",
-            do="use --pictures edi, or 1 instant",
+            do="use --images edi, or 1 instant",
         )
     plain = np.flatnonzero(~blurred) if source == "edi" else np.arange(len(frames))
     made = Sharp(
@@ -79,15 +79,15 @@ def sharp_pictures(capture: Capture, source: Source, *, instants: int = 1) -> Sh
         order = _sharpest(made, frames.track, order)
     return replace(
         made,
-        pictures=made.pictures[order],
+        images=made.images[order],
         frame=made.frame[order],
         time_us=made.time_us[order],
     )
 
 
-def sharpness(pictures: UInt8[np.ndarray, "n h w c"]) -> Float[np.ndarray, "n"]:
-    """Energy of the gradient of each picture, for comparison with its neighbours."""
-    return np.array([float(gradient_energy(torch.from_numpy(one / 255.0))) for one in pictures])
+def sharpness(images: UInt8[np.ndarray, "n h w c"]) -> Float[np.ndarray, "n"]:
+    """Energy of the gradient of each image, for comparison with its neighbours."""
+    return np.array([float(gradient_energy(torch.from_numpy(one / 255.0))) for one in images])
 
 
 def _taken_apart(capture: Capture, instants: int) -> Sharp:
@@ -95,7 +95,7 @@ def _taken_apart(capture: Capture, instants: int) -> Sharp:
     made = deblur(replace(capture, split=every), DeblurOptions(instants=instants))
     return Sharp(
         "edi",
-        _display(made.pictures.reshape(-1, *made.pictures.shape[2:])),
+        _display(made.images.reshape(-1, *made.images.shape[2:])),
         np.repeat(made.frame, instants),
         made.instants_us.reshape(-1),
         made.found,
@@ -105,7 +105,7 @@ def _taken_apart(capture: Capture, instants: int) -> Sharp:
 def _joined(plain: Sharp, deblurred: Sharp) -> Sharp:
     return replace(
         deblurred,
-        pictures=np.concatenate([plain.pictures, deblurred.pictures]),
+        images=np.concatenate([plain.images, deblurred.images]),
         frame=np.concatenate([plain.frame, deblurred.frame]),
         time_us=np.concatenate([plain.time_us, deblurred.time_us]),
     )
@@ -114,8 +114,8 @@ def _joined(plain: Sharp, deblurred: Sharp) -> Sharp:
 def _sharpest(
     made: Sharp, track: Int64[np.ndarray, "m"], order: Int64[np.ndarray, "n"]
 ) -> Int64[np.ndarray, "k"]:
-    """Of each few consecutive pictures of one track, the sharpest."""
-    energy = sharpness(made.pictures)
+    """Of each few consecutive images of one track, the sharpest."""
+    energy = sharpness(made.images)
     kept = []
     for one in np.unique(track[made.frame]):
         own = order[track[made.frame[order]] == one]

@@ -1,8 +1,8 @@
-"""Structure from motion: where pictures were taken from, found from the pictures alone.
+"""Structure from motion: where images were taken from, found from the images alone.
 
 COLMAP does the work (the package `pycolmap`, extra `sfm`): features, matches that fit the geometry
-of two views, then a *map* of points that grows picture by picture. It is told of small and noisy
-pictures: fainter features and fewer agreeing points suffice than by default. Where pictures are
+of two views, then a *map* of points that grows image by image. It is told of small and noisy
+images: fainter features and fewer agreeing points suffice than by default. Where images are
 left out, it is tried again with fainter features still, and the better map is kept.
 
 Source: Schönberger and Frahm, "Structure-from-motion revisited" (CVPR 2016).
@@ -36,15 +36,15 @@ FOUND_MODELS = {
 """COLMAP's models of the lenses that can be found."""
 
 LEAST_FEATURES = 80
-"""Fewer in a picture are why it fails."""
+"""Fewer in a image are why it fails."""
 LEAST_MATCHES = 15
 """Matches that agree on the geometry of two views, to count as seeing the same."""
 LEAST_POINTS = 12
-"""Points of the map that must agree on a picture's pose."""
-LEAST_PICTURES = 3
+"""Points of the map that must agree on a image's pose."""
+LEAST_IMAGES = 3
 """Of a map."""
 EXHAUSTIVE = 160
-"""Up to so many pictures all pairs are compared; of more, each with its neighbours in time."""
+"""Up to so many images all pairs are compared; of more, each with its neighbours in time."""
 NEIGHBOURS = 20
 
 QUIET = 3
@@ -60,11 +60,11 @@ class Effort:
     guided: bool = False
     """Match again along the lines that the geometry of two views allows."""
     first_pair: int = 100
-    """Agreeing matches of the two pictures the map begins with."""
+    """Agreeing matches of the two images the map begins with."""
 
 
 EFFORTS = (Effort(0.0067), Effort(0.002, guided=True, first_pair=40))
-"""Tried in turn while pictures are left out."""
+"""Tried in turn while images are left out."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +80,13 @@ class LensTask:
 
 @dataclass(frozen=True)
 class Seen:
-    """What COLMAP saw in each picture."""
+    """What COLMAP saw in each image."""
 
     features: Int64[np.ndarray, "n"]
     matches: Int64[np.ndarray, "n"]
-    """That agree with the picture it has most in common with."""
+    """That agree with the image it has most in common with."""
     partners: Int64[np.ndarray, "n"]
-    """Pictures it has something in common with."""
+    """Images it has something in common with."""
     flat_pairs: float
     """Share of pairs in which a plane, or turning on the spot, explains all matches."""
 
@@ -102,23 +102,23 @@ class Map:
     points: Float64[np.ndarray, "m 3"]
     point_error_px: Float64[np.ndarray, "m"]
     sightings: Int64[np.ndarray, "o 2"]
-    """Which picture shows which point."""
+    """Which image shows which point."""
     error_px: Float64[np.ndarray, "n"]
-    """Mean reprojection error of each picture; NaN where not registered."""
+    """Mean reprojection error of each image; NaN where not registered."""
 
     @property
     def track_length(self) -> Int64[np.ndarray, "m"]:
-        """How many pictures show each point."""
+        """How many images show each point."""
         return np.bincount(self.sightings[:, 1], minlength=len(self.points))
 
 
-def map_pictures(
-    pictures: UInt8[np.ndarray, "n h w c"], task: LensTask, *, seed: int = 0
+def map_images(
+    images: UInt8[np.ndarray, "n h w c"], task: LensTask, *, seed: int = 0
 ) -> tuple[Map | None, Seen]:
-    """Find where pictures of one camera were taken from.
+    """Find where images of one camera were taken from.
 
     Args:
-        pictures: Display-referred, in the order of time.
+        images: Display-referred, in the order of time.
         task: About the lens.
         seed: Of what is drawn by chance.
 
@@ -127,26 +127,26 @@ def map_pictures(
 
     Raises:
         MissingExtra: pycolmap is not installed.
-        CaptureError: There are too few pictures.
+        CaptureError: There are too few images.
     """
     colmap = need("pycolmap", extra="sfm", purpose="finding poses")
-    if len(pictures) < LEAST_PICTURES:
+    if len(images) < LEAST_IMAGES:
         raise CaptureError(
-            "too few pictures to find poses from",
-            got=f"{len(pictures)}, at least {LEAST_PICTURES} are needed",
+            "too few images to find poses from",
+            got=f"{len(images)}, at least {LEAST_IMAGES} are needed",
         )
     best: tuple[Map | None, Seen] | None = None
     with tempfile.TemporaryDirectory(prefix="sharpfield-poses-") as folder, _quiet(colmap):
-        names = [f"{i:06d}.png" for i in range(len(pictures))]
+        names = [f"{i:06d}.png" for i in range(len(images))]
         (Path(folder) / "images").mkdir()
-        for name, picture in zip(names, pictures, strict=True):
-            write_image(Path(folder) / "images" / name, picture)
+        for name, image in zip(names, images, strict=True):
+            write_image(Path(folder) / "images" / name, image)
         for number, effort in enumerate(EFFORTS):
             work = _Work(colmap, Path(folder), names, task, seed)
             made = work.run(effort, Path(folder) / str(number))
             if best is None or _count(made[0]) > _count(best[0]):
                 best = made
-            if _count(best[0]) == len(pictures):
+            if _count(best[0]) == len(images):
                 break
     assert best is not None, "there is at least one effort"
     return best
@@ -168,7 +168,7 @@ def _quiet(colmap: ModuleType) -> Generator[None, None, None]:
 
 @dataclass(frozen=True)
 class _Work:
-    """One run of COLMAP over a folder of pictures."""
+    """One run of COLMAP over a folder of images."""
 
     colmap: ModuleType
     folder: Path
@@ -239,7 +239,7 @@ class _Work:
 
     def _grow(self, database: Path, place: Path, effort: Effort) -> Map | None:
         options = self.colmap.IncrementalPipelineOptions()
-        options.multiple_models, options.min_model_size = False, LEAST_PICTURES
+        options.multiple_models, options.min_model_size = False, LEAST_IMAGES
         options.extract_colors, options.random_seed = False, self.seed
         found = self.task.intrinsics != "given"
         options.ba_refine_focal_length = options.ba_refine_extra_params = found

@@ -1,4 +1,4 @@
-"""From poses of pictures to where the camera is at any time.
+"""From poses of images to where the camera is at any time.
 
 Frames of a camera that moved lie on one path: a cubic through the poses found, SLERP for its
 rotation. It begins where the first shutter opened and ends where the last one closed; these two

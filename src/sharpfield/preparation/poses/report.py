@@ -1,6 +1,6 @@
-"""What finding poses leaves behind in numbers and words: which pictures, how well, and why not.
+"""What finding poses leaves behind in numbers and words: which images, how well, and why not.
 
-The page that `sharpfield poses` leaves beside the capture: pictures, points, path, numbers.
+The page that `sharpfield poses` leaves beside the capture: images, points, path, numbers.
 """
 
 import html
@@ -19,7 +19,7 @@ from sharpfield.preparation.poses.find import PosesFound
 from sharpfield.preparation.poses.find_checks import advice
 from sharpfield.report import page
 from sharpfield.report.figures import trajectory_figure
-from sharpfield.report.page import Look, Picture, View, section
+from sharpfield.report.page import Image, Look, View, section
 from sharpfield.report.tables import Table, as_html
 
 
@@ -36,11 +36,11 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
     names = original.needed_frames.names
     return {
         "capture": original.name,
-        "pictures_from": sharp.source,
+        "images_from": sharp.source,
         "thresholds": None
         if known is None
         else {"negative": known.negative, "positive": known.positive},
-        "pictures": len(sharp),
+        "images": len(sharp),
         "registered": int(there.sum()),
         "frames": {
             "before": len(original.needed_frames),
@@ -71,12 +71,12 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
 
 
 def as_text(about: dict[str, Any]) -> str:
-    """The summary in lines for a terminal; every picture that failed says why and what to do."""
+    """The summary in lines for a terminal; every image that failed says why and what to do."""
     frames, points, camera = about["frames"], about["points"], about["camera"]
     lines = [
-        f"{about['registered']} of {about['pictures']} pictures have a pose"
-        f" (taken from {about['pictures_from']}), {about['error_px']} px off on average",
-        f"{points['map']} points, each seen in {points['mean_track_length']} pictures",
+        f"{about['registered']} of {about['images']} images have a pose"
+        f" (taken from {about['images_from']}), {about['error_px']} px off on average",
+        f"{points['map']} points, each seen in {points['mean_track_length']} images",
         f"focal length {camera['focal_px'][0]} px ({camera['from']}), depth"
         f" {about['bounds']['near']} to {about['bounds']['far']}",
         f"{frames['after']} of {frames['before']} frames are in the new capture:"
@@ -111,7 +111,7 @@ def _relief(found: PosesFound) -> dict[str, Any] | None:
 def _each(original: Capture, found: PosesFound) -> list[dict[str, Any]]:
     sharp, mapped, seen = found.sharp, found.map, found.seen
     points = np.bincount(mapped.sightings[:, 0], minlength=len(sharp))
-    failures = {failure.picture: failure for failure in found.failures}
+    failures = {failure.image: failure for failure in found.failures}
     rows = []
     for i in range(len(sharp)):
         row: dict[str, Any] = {
@@ -136,10 +136,10 @@ def _rounded(value: float, digits: int) -> float:
 
 LOOK = Look(640, 82)
 SHOWN = 6
-"""Pictures shown, beside all that failed up to as many."""
+"""Images shown, beside all that failed up to as many."""
 GREEN, AMBER = (40, 200, 90), (245, 160, 40)
 ZOOM = 2
-"""Small pictures are enlarged, so that marks on them can be told apart."""
+"""Small images are enlarged, so that marks on them can be told apart."""
 SMALL = 480
 
 
@@ -158,7 +158,7 @@ def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str
             _header(about),
             _flat(about),
             _failures(about),
-            _pictures(original, found),
+            _images(original, found),
             section(
                 "The path",
                 page.drawing(
@@ -178,12 +178,12 @@ def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str
 def _header(about: dict[str, Any]) -> str:
     points, camera = about["points"], about["camera"]
     values = [
-        (f"{about['registered']} of {about['pictures']}", "pictures with a pose", "registered"),
-        (f"{about['error_px']:.2f} px", "reprojection error", "mean over pictures"),
+        (f"{about['registered']} of {about['images']}", "images with a pose", "registered"),
+        (f"{about['error_px']:.2f} px", "reprojection error", "mean over images"),
         (
             f"{points['map']:,}",
             "points",
-            f"each seen in {points['mean_track_length']:.1f} pictures",
+            f"each seen in {points['mean_track_length']:.1f} images",
         ),
         (f"{camera['focal_px'][0]:.1f} px", "focal length", str(camera["from"])),
         (
@@ -198,7 +198,7 @@ def _header(about: dict[str, Any]) -> str:
         "edi": "frames deblurred with their events",
         "frames": "frames as they are",
         "sharpest": "the sharpest of each three frames",
-    }[about["pictures_from"]]
+    }[about["images_from"]]
     return (
         f'<header>\n<p class="eyebrow">sharpfield poses</p>\n<h1>{html.escape(about["capture"])}'
         f'</h1>\n<p class="subtitle">From {told}</p>\n{page.cards(values)}</header>'
@@ -221,11 +221,11 @@ def _failures(about: dict[str, Any]) -> str:
     )
     if not rows:
         return ""
-    table = Table(("picture", "features", "matches", "why it has no pose", "what to try"), rows)
+    table = Table(("image", "features", "matches", "why it has no pose", "what to try"), rows)
     return section("Without a pose", as_html(table))
 
 
-def _pictures(original: Capture, found: PosesFound) -> str:
+def _images(original: Capture, found: PosesFound) -> str:
     lost = np.flatnonzero(~found.map.registered)[:SHOWN]
     good = np.flatnonzero(found.map.registered)
     spread = evenly_spread(good, SHOWN)
@@ -233,37 +233,37 @@ def _pictures(original: Capture, found: PosesFound) -> str:
     return section(
         "What was seen",
         page.comparison(views, LOOK, left="recorded", right="used"),
-        intro="Recorded frames, and the pictures poses were found from with the points seen in"
+        intro="Recorded frames, and the images poses were found from with the points seen in"
         " them: green within a pixel of where they project, amber farther.",
     )
 
 
-def _view(original: Capture, found: PosesFound, picture: int) -> View:
-    frame = int(found.sharp.frame[picture])
+def _view(original: Capture, found: PosesFound, image: int) -> View:
+    frame = int(found.sharp.frame[image])
     name = original.needed_frames.names[frame]
     held = original.needed_frames
     recorded = np.rint(np.asarray(held.images[frame], np.float64) * (255 / held.white))
     said = (
-        f"{name}, used: {found.map.error_px[picture]:.2f} px"
-        if found.map.registered[picture]
+        f"{name}, used: {found.map.error_px[image]:.2f} px"
+        if found.map.registered[image]
         else f"{name}: no pose"
     )
     return View(
-        f"{name} ({picture})",
+        f"{name} ({image})",
         (
-            Picture("recorded", _large(recorded.astype(np.uint8)), name, f"{name} as recorded"),
-            Picture("used", _marked(found, picture), said, f"{name} with the points seen in it"),
+            Image("recorded", _large(recorded.astype(np.uint8)), name, f"{name} as recorded"),
+            Image("used", _marked(found, image), said, f"{name} with the points seen in it"),
         ),
     )
 
 
-def _marked(found: PosesFound, picture: int) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with the points of the map projected into it."""
-    shown = np.ascontiguousarray(_large(found.sharp.pictures[picture]))
-    if not found.map.registered[picture]:
+def _marked(found: PosesFound, image: int) -> UInt8[np.ndarray, "h w 3"]:
+    """The image with the points of the map projected into it."""
+    shown = np.ascontiguousarray(_large(found.sharp.images[image]))
+    if not found.map.registered[image]:
         return shown
-    rows = found.map.sightings[found.map.sightings[:, 0] == picture, 1]
-    pose = found.map.poses[picture]
+    rows = found.map.sightings[found.map.sightings[:, 0] == image, 1]
+    pose = found.map.poses[image]
     local = (found.map.points[rows] - pose[:, 3]) @ pose[:, :3]
     xy = found.map.camera.project(torch.from_numpy(local)).numpy() * (
         shown.shape[1] / found.map.camera.width
@@ -274,9 +274,9 @@ def _marked(found: PosesFound, picture: int) -> UInt8[np.ndarray, "h w 3"]:
     return shown
 
 
-def _large(picture: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+def _large(image: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
     """In three channels, and large enough to look at."""
-    colour = np.repeat(picture, 3, -1) if picture.shape[-1] == 1 else picture
+    colour = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image
     if max(colour.shape) >= SMALL:
         return colour
     return cv2.resize(colour, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC)
@@ -295,4 +295,4 @@ def _table(about: dict[str, Any]) -> str:
         for one in about["each"]
     )
     table = Table(("frame", "time, ms", "features", "partners", "points", "error, px"), rows)
-    return section("Each picture", page.folded_if_long("All pictures", as_html(table), len(rows)))
+    return section("Each image", page.folded_if_long("All images", as_html(table), len(rows)))

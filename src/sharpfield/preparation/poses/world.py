@@ -1,4 +1,4 @@
-"""Which world poses are written in: pictures alone leave its scale, place and direction open.
+"""Which world poses are written in: images alone leave its scale, place and direction open.
 
 By default the average camera is the origin and looks along z, and the points seen lie at a median
 depth of one. Where depth was measured, it gives the scale. Where positions are known from
@@ -22,7 +22,7 @@ MEDIAN_DEPTH = 1.0
 
 @dataclass(frozen=True)
 class Known:
-    """Where the camera was at the instants of the pictures, as something else says."""
+    """Where the camera was at the instants of the images, as something else says."""
 
     poses: Float64[np.ndarray, "n 3 4"]
     """World-from-camera; NaN where unknown."""
@@ -68,12 +68,12 @@ def known_world(found: Map, known: Known) -> tuple[Similarity, float]:
         The change, and the root mean square distance in units of that world.
 
     Raises:
-        CaptureError: Fewer than three pictures have both poses.
+        CaptureError: Fewer than three images have both poses.
     """
     both = found.registered & np.isfinite(known.poses).all((1, 2))
     if both.sum() < 3:
         raise CaptureError(
-            "too few pictures have a pose in the file to align to",
+            "too few images have a pose in the file to align to",
             got=f"{both.sum()}, at least 3 are needed",
             do="check the clock of the file: --offset-ms moves it",
         )

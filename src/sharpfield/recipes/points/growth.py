@@ -1,4 +1,4 @@
-"""Neural points become more where pictures show a surface that no point is near, and fewer.
+"""Neural points become more where images show a surface that no point is near, and fewer.
 
 A ray that *missed* came near no point, though its pixel differs from the background. Beside such
 pixels there are rays that hit; where one of them is stopped by a single place, a point is added

@@ -17,7 +17,7 @@ from sharpfield.core.errors import RunError
 from sharpfield.fields.points.cloud import NeuralPoints
 from sharpfield.fields.points.networks import ColourHead, PointField
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
-from sharpfield.recipes.points.images import PictureBranch
+from sharpfield.recipes.points.images import ImageBranch
 
 POINTS = {
     "positions": "xyz",
@@ -59,7 +59,7 @@ def read_released(path: Path) -> dict[str, Tensor]:
 
 
 def recognised(table: Mapping[str, object]) -> bool:
-    """Whether names are those of the released code, with its pictures' branch."""
+    """Whether names are those of the released code, with its images' branch."""
     wanted = [f"neural_points.{theirs}" for theirs in POINTS.values()]
     wanted += ["aggregator.block1.0.weight", "aggregator.color_final_block.0.weight"]
     return all(name in table for name in wanted)
@@ -69,7 +69,7 @@ def load_released(
     path: Path,
     field: PointField,
     head: ColourHead,
-    pictures: PictureBranch | None,
+    images: ImageBranch | None,
     blur: ChosenKernel | LearnedKernel | None,
 ) -> None:
     """Give points and networks the values of a released checkpoint, and as many points.
@@ -78,7 +78,7 @@ def load_released(
         path: Of the file.
         field: Its points become those of the checkpoint.
         head: Makes colours.
-        pictures: Networks that read pictures; left alone if None.
+        images: Networks that read images; left alone if None.
         blur: Gets its network if it has one and the checkpoint, too.
 
     Raises:
@@ -92,12 +92,12 @@ def load_released(
         (field.to_feature.layers, "color_feature_branch"),
         (head.layer.layers, "color_final_block"),
     ]
-    if pictures is not None:
+    if images is not None:
         parts += [
-            (pictures.merging.network.layers, "aux_merge_weight_block"),
-            (pictures.mixing.network.layers, "color_mixup_block"),
+            (images.merging.network.layers, "aux_merge_weight_block"),
+            (images.mixing.network.layers, "color_mixup_block"),
         ]
-        parts += list(zip(pictures.extractor.stages, STAGES, strict=True))
+        parts += list(zip(images.extractor.stages, STAGES, strict=True))
     if isinstance(blur, LearnedKernel) and "aggregator.learn_blur_kernel_block.0.weight" in table:
         parts.append((blur.network.layers, "learn_blur_kernel_block"))
     for layers, name in parts:

@@ -1,11 +1,11 @@
 """The image branch: what the training frames show of places on rays, joined with the points' own.
 
-In training some rays must do *without* pictures, so that points learn to stand alone; what the
-pictures add then varies less from view to view.
+In training some rays must do *without* images, so that points learn to stand alone; what the
+images add then varies less from view to view.
 
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.1.
 
-Which pictures tell about places on a ray, and where in them: sources, projection, visibility.
+Which images tell about places on a ray, and where in them: sources, projection, visibility.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from sharpfield.ops.pyramid import look_up
 from sharpfield.rendering.points import Asked
 
 AHEAD = 1e-6
-"""Least depth of what a picture shows."""
+"""Least depth of what a image shows."""
 
 APART = 0.25
 """Cameras this share of the largest depth apart count as looking in orthogonal directions."""
@@ -35,7 +35,7 @@ EQUAL = 0.02
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Pictures beside the points. Defaults: Hybrid Neural Rendering's."""
+    """Images beside the points. Defaults: Hybrid Neural Rendering's."""
 
     count: int = 4
     """Asked about each place; 0 for none."""
@@ -45,16 +45,16 @@ class SourceOptions:
     fetch: Literal["nearest", "bilinear"] = "nearest"
     """Whole pixels, as published, or between them."""
     visibility: Literal["none", "depth"] = "none"
-    """Whether what a picture does not show is told by its network alone, as published, or by
+    """Whether what a image does not show is told by its network alone, as published, or by
     depth."""
     slack: float = 1.0
     """How far behind the measured depth a place still counts as visible, in radii of neighbours."""
     drop: float = 0.5
-    """Share of the rays that must do without pictures in training."""
+    """Share of the rays that must do without images in training."""
     trust: float = 0.0
-    """Power of a picture's quality that its weight is multiplied by; 0 as published."""
+    """Power of a image's quality that its weight is multiplied by; 0 as published."""
     prefer: float = 0.0
-    """Power of a picture's quality when sources are chosen by pose."""
+    """Power of a image's quality when sources are chosen by pose."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Shown:
     """Where places are in their sources."""
 
     source: Int64[Tensor, "n v"]
-    """Number in the list of pictures that were prepared."""
+    """Number in the list of images that were prepared."""
     xy: Float[Tensor, "n v 2"]
     """In pixels."""
     change: Float[Tensor, "n v 3"]
     """Unit direction from the source to the place, minus that of the ray."""
     visible: Float[Tensor, "n v"]
-    """0...1; 0 outside of the picture and behind the camera."""
+    """0...1; 0 outside of the image and behind the camera."""
 
 
 class ImageSources(nn.Module):
@@ -137,7 +137,7 @@ class ImageSources(nn.Module):
         count = min(self.options.count, len(self.learned) - 1)
         return self.learned[score.topk(count, largest=False).indices]
 
-    def pictures(self, frames: Int64[Tensor, "u"]) -> Float[Tensor, "u h w c"]:
+    def frame_images(self, frames: Int64[Tensor, "u"]) -> Float[Tensor, "u h w c"]:
         """Some frames as stored, 0...1."""
         held = [np.asarray(self.images[i]) for i in frames.tolist()]
         stored = torch.from_numpy(np.stack(held).astype(np.float32) / np.float32(self.white))
@@ -155,7 +155,7 @@ class ImageSources(nn.Module):
         Args:
             places: In the world.
             direction: Of the ray each is on.
-            frames: The pictures that were prepared.
+            frames: The images that were prepared.
             source: Number of each place's sources in that list.
         """
         pose = self.poses[frames][source]  # [n, v, 3, 4]
@@ -214,23 +214,23 @@ def nearest_in_order(
 
 @dataclass(frozen=True)
 class Prepared:
-    """Pictures for the rays of one batch."""
+    """Images for the rays of one batch."""
 
     frames: Int64[Tensor, "u"]
     """All sources of all rays, once each."""
     source: Int64[Tensor, "b v"]
     """Those of each ray, as numbers in that list."""
     levels: list[Float[Tensor, "u _h _w _f"]]
-    """The pictures and their maps."""
+    """The images and their maps."""
     alone: Bool[Tensor, "b"]
     """Rays that do without."""
 
 
-class PictureBranch(nn.Module):
+class ImageBranch(nn.Module):
     """Sources, the networks that read them, and those that join them with points.
 
     Args:
-        options: Which pictures, and how they are read.
+        options: Which images, and how they are read.
         capture: With frames.
         feature: Width of the feature of a place.
         seed: Of the run.
@@ -262,28 +262,28 @@ class PictureBranch(nn.Module):
     def prepare(
         self, rays: Rays, frame: Int64[Tensor, "b"], alone: Bool[Tensor, "b"], *, learning: bool
     ) -> Prepared:
-        """Choose sources for rays and read their pictures.
+        """Choose sources for rays and read their images.
 
         Args:
             rays: On one leading axis.
             frame: That each belongs to, or is nearest to.
-            alone: Rays that do without pictures.
+            alone: Rays that do without images.
             learning: Whether a ray's own frame must not tell.
         """
         chosen = self.sources.of_rays(frame, rays.origin, rays.direction, exclude=learning)
         frames, source = torch.unique(chosen, return_inverse=True)
-        levels = self.extractor(self.sources.pictures(frames))
+        levels = self.extractor(self.sources.frame_images(frames))
         return Prepared(frames, source, levels, alone)
 
     def forward(
         self, feature: Float[Tensor, "n r"], asked: Asked, ready: Prepared
     ) -> tuple[Float[Tensor, "n r"], Float[Tensor, "n c"], Float[Tensor, "n 1"]]:
-        """Features that know what pictures show, and what pictures say of the colour itself.
+        """Features that know what images show, and what images say of the colour itself.
 
         Args:
             feature: Of the places, from points.
             asked: The places.
-            ready: Pictures of their rays.
+            ready: Images of their rays.
 
         Returns:
             Mixed features; sum of the sources' colours by weight; sum of these weights.
@@ -293,9 +293,9 @@ class PictureBranch(nn.Module):
         xy = shown.xy.floor() + 0.5 if self.options.fetch == "nearest" else shown.xy
         looked = look_up(xy.flatten(0, 1), source.flatten(), ready.levels)
         looked = looked.view(*source.shape, looked.shape[-1])
-        with_pictures = ~ready.alone[asked.ray][:, None]
+        with_images = ~ready.alone[asked.ray][:, None]
         merged, weight = self.merging(looked, feature, shown.change, shown.visible)
-        weight = weight * with_pictures
-        mixed = self.mixing(feature, merged * with_pictures)
+        weight = weight * with_images
+        mixed = self.mixing(feature, merged * with_images)
         light = (weight[..., None] * looked[..., : self.colours]).sum(1)
         return mixed, light, weight.sum(-1, keepdim=True)

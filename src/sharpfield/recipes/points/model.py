@@ -1,7 +1,7 @@
-"""The model of recipes on neural points: a scene and, where a recipe has them, pictures and blur.
+"""The model of recipes on neural points: a scene and, where a recipe has them, images and blur.
 
 A step looks at patches of a few frames; patches of one pixel are pixels. The colour of a place
-comes from its points, and from pictures if there is a branch for them.
+comes from its points, and from images if there is a branch for them.
 
 How much each frame of a capture counts, for how sharp it is.
 """
@@ -29,7 +29,7 @@ from sharpfield.formation.shutter import Pinhole
 from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.losses.photometric import indecision
 from sharpfield.recipes.points.growth import GrowthOptions, grown, missing_points
-from sharpfield.recipes.points.images import PictureBranch, Prepared
+from sharpfield.recipes.points.images import ImageBranch, Prepared
 from sharpfield.recipes.points.scene import MarchOptions, PointScene
 from sharpfield.rendering.points import Asked, Met
 from sharpfield.sampling.patches import PatchShape, draw_patches
@@ -122,7 +122,7 @@ class PointModel(nn.Module):
         capture: As read; the model stays in its world.
         seed: Of the run.
         scene: The points and their networks.
-        pictures: What training frames add, if anything.
+        images: What training frames add, if anything.
         blur: From rendered patches to recorded ones; None if frames are taken as they are.
         light: Whether blur adds up light, or what frames store.
         weight: How much each frame counts; one on average.
@@ -137,7 +137,7 @@ class PointModel(nn.Module):
         seed: int,
         scene: PointScene,
         *,
-        pictures: PictureBranch | None = None,
+        images: ImageBranch | None = None,
         blur: ChosenKernel | LearnedKernel | None = None,
         light: Literal["stored", "linear"] = "stored",
         weight: Float[np.ndarray, "n"] | None = None,
@@ -147,7 +147,7 @@ class PointModel(nn.Module):
         frames = capture.needed_frames
         self.tone = tone_of(frames.encoding)
         self.table = pixel_table(capture)
-        self.scene, self.pictures, self.blur, self.light = scene, pictures, blur, light
+        self.scene, self.images, self.blur, self.light = scene, images, blur, light
         self.head = ColourHead(recipe.sizes.feature, frames.channels, seed=seed)
         self.pinhole = Pinhole(capture.camera, capture.trajectory)
         even = np.ones(len(frames)) if weight is None else weight
@@ -156,17 +156,17 @@ class PointModel(nn.Module):
     weight: Tensor
 
     def draw(self, step: int) -> Batch:
-        """Patches of training frames, apart from those that must do without pictures."""
+        """Patches of training frames, apart from those that must do without images."""
         drawn = self.recipe.drawn
         shape = PatchShape(drawn.side, drawn.apart if drawn.side > 1 else (1, 1), drawn.border)
         seen = draw_patches(
             self.table, drawn.patches, shape, frames=drawn.frames, seed=self.seed, step=step
         ).to(self.scene.device)
-        if self.pictures is None:
+        if self.images is None:
             return {"frames": seen}
         made = generator(self.seed, step, "alone")
         mixed = torch.randperm(len(seen), generator=made).to(seen.device)
-        alone = int(len(seen) * self.pictures.options.drop)
+        alone = int(len(seen) * self.images.options.drop)
         batch: Batch = {"frames": seen[mixed[alone:]]}
         return batch | {"alone": seen[mixed[:alone]]} if alone else batch
 
@@ -177,10 +177,10 @@ class PointModel(nn.Module):
         flat = seen.reshape(-1)
         rays = self.pinhole.expose(flat)[:, 0]
         ready = None
-        if self.pictures is not None:
+        if self.images is not None:
             alone = torch.arange(len(seen), device=seen.device) >= len(parts[0])
             alone = alone.repeat_interleave(seen.shape[1] * seen.shape[2])
-            ready = self.pictures.prepare(rays, flat.frame, alone, learning=True)
+            ready = self.images.prepare(rays, flat.frame, alone, learning=True)
         met = self.scene.meet(
             rays, lambda asked: self.colour(asked, ready), frame=flat.frame, step=step
         )
@@ -197,9 +197,9 @@ class PointModel(nn.Module):
         if self.recipe.start_colours:
             start = field.mean_colour(asked.rows, asked.way)
         feature = field.feature(asked.hidden, asked.direction)
-        if self.pictures is not None and ready is not None:
-            feature, light, weight = self.pictures(feature, asked, ready)
-            if start is not None:  # points count as one more picture
+        if self.images is not None and ready is not None:
+            feature, light, weight = self.images(feature, asked, ready)
+            if start is not None:  # points count as one more image
                 start = (start + light) / (1 + weight)
         return self.head(feature, start)
 
@@ -207,14 +207,14 @@ class PointModel(nn.Module):
         """Sharp linear light."""
         flat = rays.reshape(-1)
         frame, ready = self.scene.frame_at(flat.time), None
-        if self.pictures is not None:
+        if self.images is not None:
             alone = torch.zeros_like(frame, dtype=torch.bool)
-            ready = self.pictures.prepare(flat, frame, alone, learning=False)
+            ready = self.images.prepare(flat, frame, alone, learning=False)
         met = self.scene.meet(flat, lambda asked: self.colour(asked, ready), frame=frame)
         light = self.tone.decode(met.colour.clamp(0, 1))
         return Radiance(light, met.depth, met.opacity, flat.weight).reshape(*rays.shape)
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 
@@ -235,7 +235,7 @@ class PointModel(nn.Module):
         networks = exponential(recipe.rate, recipe.decay * recipe.rate, until=until)
         points = exponential(recipe.points_rate, recipe.decay * recipe.points_rate, until=until)
         groups = self.scene.groups(networks, points)
-        for name in ("head", "pictures", "blur"):
+        for name in ("head", "images", "blur"):
             part = getattr(self, name)
             if part is not None and (own := tuple(part.parameters())):
                 groups.append(Group(name, own, networks))

@@ -24,14 +24,14 @@ from sharpfield.losses.event_counts import event_terms
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions, DynamicScene
 from sharpfield.recipes.splats.learned_calibration import (
     FLOOR,
-    UnknownOptions,
-    Unknowns,
+    LearnedCalibration,
+    LearnedCalibrationOptions,
     falling,
     pose_groups,
     with_learned_poses,
 )
-from sharpfield.recipes.splats.scene import settling
-from sharpfield.sampling.rig_views import RigLookOptions, RigLooks
+from sharpfield.recipes.splats.scene import cooldown
+from sharpfield.sampling.rig_views import RigSamplingOptions, RigViewSampler
 from sharpfield.storage.event_cache import event_index
 
 Terms = dict[str, Tensor]
@@ -52,12 +52,12 @@ class DynamicNumbers(Protocol):
         ...
 
     @property
-    def looks(self) -> RigLookOptions:
+    def looks(self) -> RigSamplingOptions:
         """What steps look at."""
         ...
 
     @property
-    def unknowns(self) -> UnknownOptions:
+    def unknowns(self) -> LearnedCalibrationOptions:
         """What else is learned."""
         ...
 
@@ -78,9 +78,11 @@ class DynamicModel(nn.Module):
         self.capture = with_learned_poses(moved, recipe.unknowns)
         self.path = self.capture.trajectory
         self.tone = tone_of(capture.frames.encoding if capture.frames else "gamma2.2")
-        self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
+        self.unknowns = LearnedCalibration(recipe.unknowns, self.capture, seed)
         offset = self.unknowns.offset_steps is not None
-        self.looks = RigLooks(recipe.looks, self.capture, seed, steps=recipe.steps, offset=offset)
+        self.looks = RigViewSampler(
+            recipe.looks, self.capture, seed, steps=recipe.steps, offset=offset
+        )
         # Without frames nothing says what stands still but what passes before it.
         alone = recipe.looks.still if capture.frames is not None else 0.0
         self.scene = DynamicScene(
@@ -93,7 +95,7 @@ class DynamicModel(nn.Module):
             seed=seed,
         )
         settles = max(self.looks.late_from, self.scene.last_growth)
-        self.guidance = settling(settles, recipe.steps, left=recipe.looks.fading)
+        self.guidance = cooldown(settles, recipe.steps, left=recipe.looks.fading)
         self.floor = float(capture.notes.get("log_floor", FLOOR))
 
     @property
@@ -103,12 +105,12 @@ class DynamicModel(nn.Module):
 
     def draw(self, step: int) -> Batch:
         """Several cameras at the same few instants."""
-        batch = self.looks.draw(step, self.unknowns.belief())
+        batch = self.looks.draw(step, self.unknowns.sensor_estimate())
         device = self.scene.behind.device
         return {name: seen.to(device) for name, seen in batch.items()}
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Errors of sharp pictures, of frames, and of the events between instants."""
+        """Errors of sharp images, of frames, and of the events between instants."""
         assert isinstance(look := batch["look"], Instants)
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
         only_events = events is not None and frames is None and sharp is None
@@ -159,7 +161,7 @@ class DynamicModel(nn.Module):
 
     def through(self, camera: Camera) -> "OtherLens":
         """The same scene, seen by another camera than the capture's."""
-        return OtherLens(self.scene, camera)
+        return WithCamera(self.scene, camera)
 
     def render(self, rays: Rays) -> Radiance:
         """Not possible: Gaussians are drawn as whole views.
@@ -173,7 +175,7 @@ class DynamicModel(nn.Module):
             do="call draw_views",
         )
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 
@@ -196,7 +198,7 @@ class DynamicModel(nn.Module):
 
 
 @dataclass(frozen=True)
-class OtherLens:
+class WithCamera:
     """A moving scene in front of a camera that did not record it."""
 
     scene: DynamicScene

@@ -14,11 +14,11 @@ from sharpfield.core.schedule import Group, Schedule, constant, exponential, sca
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Tone
 from sharpfield.events.index import EventIndex
-from sharpfield.fields.gaussians.dynamic import Together
-from sharpfield.fields.gaussians.mcmc import idleness, share_out, wander
+from sharpfield.fields.gaussians.dynamic import GaussianUnion
+from sharpfield.fields.gaussians.mcmc import opacity_scale_penalty, position_noise, relocate_and_add
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.initialisation.moving import moving_start, still_start, usual_colour
-from sharpfield.recipes.splats.scene import Rates, gaussian_groups, settling
+from sharpfield.recipes.splats.scene import Rates, cooldown, gaussian_groups
 from sharpfield.rendering.splat import Splatting
 
 Terms = dict[str, Tensor]
@@ -109,7 +109,7 @@ class DynamicScene(nn.Module):
         self.behind = nn.Parameter(usual_colour(capture, tone))
         self.splatting = Splatting(capture.camera, tone.decode)
         self.last_growth = int(options.grow_until * steps)
-        self.settling = settling(self.last_growth, steps)
+        self.cooldown = cooldown(self.last_growth, steps)
         rates = options.rates
         self.means_rate = exponential(rates.means, rates.means / 100, until=max(steps, 1))
 
@@ -134,7 +134,7 @@ class DynamicScene(nn.Module):
         if (times != times[0]).any():
             rows = [self._moment(views[i : i + 1], splatting, alone) for i in range(len(times))]
             return Radiance.cat(rows)
-        cloud = self.still if alone else Together(self.still, self.moving.at(times[0]))
+        cloud = self.still if alone else GaussianUnion(self.still, self.moving.at(times[0]))
         light = splatting(cloud, views)
         behind = self.tone.decode(self.behind.clamp(0, 1))
         return replace(light, rgb=light.rgb + (1 - light.opacity[..., None]) * behind)
@@ -144,7 +144,9 @@ class DynamicScene(nn.Module):
         options = self.options
         if step >= self.last_growth:
             return {}
-        still, moving = (torch.stack(idleness(part)).sum() for part in (self.still, self.moving))
+        still, moving = (
+            torch.stack(opacity_scale_penalty(part)).sum() for part in (self.still, self.moving)
+        )
         idle = options.idle * still + options.idle_moving * moving
         fleeting = (self.span / self.moving.spans).mean()
         return {"idle": idle, "fleeting": options.fleeting * fleeting}
@@ -161,10 +163,10 @@ class DynamicScene(nn.Module):
         for name, part in parts.items():
             made = generator(self.seed, step, f"growth of what is {name}", part.means.device)
             with torch.no_grad():
-                noise = wander(part, self.means_rate(step), made, noise=self.options.noise)
+                noise = position_noise(part, self.means_rate(step), made, noise=self.options.noise)
                 part.means.add_(noise)
             if on:
-                growth = share_out(
+                growth = relocate_and_add(
                     part.log_scales, part.opacity_logits, budget=self.budgets[name], generator=made
                 )
                 found += [] if growth is None else [(part, growth)]
@@ -176,7 +178,7 @@ class DynamicScene(nn.Module):
         for name, own, when in (("still", self.still, _always), ("moving", self.moving, later)):
             groups += [
                 Group(f"{name} {group.name}", group.parameters, when(group.rate))
-                for group in gaussian_groups(own, rates, self.means_rate, self.settling)
+                for group in gaussian_groups(own, rates, self.means_rate, self.cooldown)
             ]
         own, pace = self.moving, SLOWER / self.span
         paths = {

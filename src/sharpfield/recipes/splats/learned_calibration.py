@@ -16,10 +16,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.protocols import Response
 from sharpfield.core.schedule import Group, Schedule, constant, exponential
 from sharpfield.core.seed import generator
-from sharpfield.events.latent_frames import Belief
+from sharpfield.events.latent_frames import SensorEstimate
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds, thresholds_of
 from sharpfield.formation.response import FixedResponse, LogResidual
-from sharpfield.geometry.trajectory import LearnedKnots, LearnedShake
+from sharpfield.geometry.trajectory import LearnedExposureMotion, LearnedKnots
 
 VIRTUAL_SHUTTER = 0.5
 """Part of the time between photos of unknown motion for which their shutters are taken as open;
@@ -31,7 +31,7 @@ FIRST_SHAKE = 1e-3
 
 
 @dataclass(frozen=True)
-class UnknownOptions:
+class LearnedCalibrationOptions:
     """What is learned besides the scene, and how fast."""
 
     threshold: tuple[float, float] | None = None
@@ -56,7 +56,7 @@ class UnknownOptions:
     """Of the offset, in us a step."""
 
 
-class Unknowns(nn.Module):
+class LearnedCalibration(nn.Module):
     """The unknowns of one capture.
 
     Args:
@@ -65,7 +65,7 @@ class Unknowns(nn.Module):
         seed: Of the run.
     """
 
-    def __init__(self, options: UnknownOptions, capture: Capture, seed: int) -> None:
+    def __init__(self, options: LearnedCalibrationOptions, capture: Capture, seed: int) -> None:
         super().__init__()
         self.options, self.clock = options, capture.clock
         self.guess = thresholds_of(capture, options.threshold)
@@ -101,10 +101,10 @@ class Unknowns(nn.Module):
         negative, positive = (self.thresholds.log_guess + self.thresholds.log_factor).exp().tolist()
         return negative, positive
 
-    def belief(self) -> Belief:
+    def sensor_estimate(self) -> SensorEstimate:
         """What is believed of the event camera now, in steps too small to matter.
 
-        In steps, so that pictures made from it need not be made anew at every step.
+        In steps, so that images made from it need not be made anew at every step.
         """
         negative, positive = (
             math.exp(round(math.log(c) / THRESHOLD_STEP) * THRESHOLD_STEP)
@@ -113,7 +113,7 @@ class Unknowns(nn.Module):
         late = round(self.offset_us / OFFSET_STEP_US) * OFFSET_STEP_US
         if isinstance(self.thresholds, FixedThresholds):
             negative, positive = self.guess
-        return Belief(negative, positive, late)
+        return SensorEstimate(negative, positive, late)
 
     def on_time(self, time: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """When what events report really happened, both 0...1 of the capture."""
@@ -164,7 +164,7 @@ def falling(rate: float, steps: int) -> Schedule:
     return exponential(rate, rate / 20, until=steps)
 
 
-def with_learned_poses(capture: Capture, options: UnknownOptions) -> Capture:
+def with_learned_poses(capture: Capture, options: LearnedCalibrationOptions) -> Capture:
     """The capture with a correction of its trajectory to learn, if one is asked for."""
     if options.knots == 0:
         return capture
@@ -173,7 +173,7 @@ def with_learned_poses(capture: Capture, options: UnknownOptions) -> Capture:
     return replace(capture, trajectory=path)
 
 
-def with_learned_shake(capture: Capture, seed: int) -> Capture:
+def with_learned_exposure_motion(capture: Capture, seed: int) -> Capture:
     """Photos of unknown motion as exposures whose motion is to be learned."""
     frames = capture.needed_frames
     middle = frames.exposure.middle_us
@@ -189,7 +189,7 @@ def with_learned_shake(capture: Capture, seed: int) -> Capture:
     learned = torch.from_numpy(capture.split.train)
     start[learned] = FIRST_SHAKE * torch.randn(len(learned), SHAKE_KNOTS, 6, generator=made)
     by_track = torch.from_numpy(frames.track)
-    path = LearnedShake(
+    path = LearnedExposureMotion(
         capture.trajectory,
         opens[by_track.argsort()],
         closes[by_track.argsort()],
@@ -202,6 +202,6 @@ def with_learned_shake(capture: Capture, seed: int) -> Capture:
 def pose_groups(capture: Capture, rate: Schedule) -> list[Group]:
     """What of the trajectory is learned."""
     path = capture.trajectory
-    learned = path.parameters() if isinstance(path, LearnedKnots | LearnedShake) else ()
+    learned = path.parameters() if isinstance(path, LearnedKnots | LearnedExposureMotion) else ()
     own = tuple(p for p in learned if p.requires_grad)
     return [Group("poses", own, rate)] if own else []

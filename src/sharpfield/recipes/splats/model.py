@@ -1,8 +1,8 @@
 """The model of all splat recipes: Gaussians, the looks of each step, and the unknowns.
 
 A step looks at whole images, or at a part of one, in one of two ways. *Early*, where events can
-make sharp pictures, it looks at one instant, drawn from the whole capture, and compares one view
-with the picture that events carry there: cheap, and from everywhere. *Late* it looks at one
+make sharp images, it looks at one instant, drawn from the whole capture, and compares one view
+with the image that events carry there: cheap, and from everywhere. *Late* it looks at one
 exposure: views at several instants of it whose mean is the blurred frame, and one instant beside
 it, with the events counted between each two that follow each other.
 """
@@ -24,7 +24,7 @@ from sharpfield.core.protocols import PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
 from sharpfield.core.tone import tone_of
-from sharpfield.events.counts import on_row_clock
+from sharpfield.events.counts import on_frame_clock
 from sharpfield.formation.mix import mix, mix_of_few
 from sharpfield.geometry.normalise import normalised
 from sharpfield.geometry.rolling import Rolling
@@ -32,16 +32,16 @@ from sharpfield.losses.event_counts import event_terms
 from sharpfield.losses.photometric import depth_error
 from sharpfield.metrics.frame_weights import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (
-    UnknownOptions,
-    Unknowns,
+    LearnedCalibration,
+    LearnedCalibrationOptions,
     falling,
     pose_groups,
+    with_learned_exposure_motion,
     with_learned_poses,
-    with_learned_shake,
 )
-from sharpfield.recipes.splats.scene import GaussianOptions, SplatScene, settling
+from sharpfield.recipes.splats.scene import GaussianOptions, SplatScene, cooldown
 from sharpfield.recipes.splats.start import starting_gaussians
-from sharpfield.sampling.views import LookOptions, Looks
+from sharpfield.sampling.views import SamplingOptions, ViewSampler
 
 Terms = dict[str, Tensor]
 
@@ -61,12 +61,12 @@ class SplatNumbers(Protocol):
         ...
 
     @property
-    def looks(self) -> LookOptions:
+    def looks(self) -> SamplingOptions:
         """What steps look at."""
         ...
 
     @property
-    def unknowns(self) -> UnknownOptions:
+    def unknowns(self) -> LearnedCalibrationOptions:
         """What else is learned."""
         ...
 
@@ -86,18 +86,18 @@ class SplatModel(nn.Module):
         self.options = recipe.looks
         self.capture, self.change = normalised(capture)
         if _motion_unknown(capture) and self.options.blur == "motion":
-            self.capture = with_learned_shake(self.capture, seed)
+            self.capture = with_learned_exposure_motion(self.capture, seed)
         else:
             self.capture = with_learned_poses(self.capture, recipe.unknowns)
         self.path, self.shutter = self.capture.trajectory, Rolling.of(self.capture)
-        aligned = with_row_clock(self.capture)
+        aligned = align_events_to_rolling_shutter(self.capture)
         self.encoding = capture.frames.encoding if capture.frames else "gamma2.2"
         self.tone = tone_of(self.encoding)
-        self.unknowns = Unknowns(recipe.unknowns, self.capture, seed)
+        self.unknowns = LearnedCalibration(recipe.unknowns, self.capture, seed)
         weights = None
         if self.options.quality != "even" and aligned.frames is not None:
             weights = frame_weights(aligned, self.options.quality)[aligned.split.train]
-        self.looks = Looks(self.options, aligned, seed, weights)
+        self.looks = ViewSampler(self.options, aligned, seed, weights)
         self.scene = SplatScene(
             recipe.gaussians,
             self.capture,
@@ -118,7 +118,7 @@ class SplatModel(nn.Module):
         self.still_until = int(self.options.still * recipe.steps)
         settles = max(self.late_from, self.scene.last_growth)
         left = 1.0 if capture.frames is None else self.options.fading
-        self.guidance = settling(settles, recipe.steps, left=left)
+        self.guidance = cooldown(settles, recipe.steps, left=left)
 
     @property
     def heaviest_step(self) -> int:
@@ -128,29 +128,31 @@ class SplatModel(nn.Module):
 
     def draw(self, step: int) -> Batch:
         """One instant in early steps; in late ones an exposure, or a stretch of events."""
-        belief = self.unknowns.belief()
+        sensor_estimate = self.unknowns.sensor_estimate()
         if step < self.late_from:
-            batch = self.looks.instant(step, belief)
+            batch = self.looks.instant(step, sensor_estimate)
         elif self.capture.frames is None:
             batch = self.looks.stretch(step)
         elif self.unknowns.offset_steps is None or self.looks.motion is None:
             still = step < self.still_until
-            batch = self.looks.exposure(step, events=not still, belief=belief, still=still)
+            batch = self.looks.exposure(
+                step, events=not still, sensor_estimate=sensor_estimate, still=still
+            )
         # Views of the frames' instants cannot tell when events really happened.
         elif step % 2:
             batch = self.looks.stretch(step)
         else:
-            batch = self.looks.exposure(step, events=False, belief=belief)
+            batch = self.looks.exposure(step, events=False, sensor_estimate=sensor_estimate)
         device = self.scene.gaussians.means.device
         return {name: seen.to(device) for name, seen in batch.items()}
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Errors of sharp pictures, of the blurred one, and of the events between instants."""
+        """Errors of sharp images, of the blurred one, and of the events between instants."""
         assert isinstance(look := batch["look"], Instants)
         frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
         only_events = events is not None and frames is None
         light = self._drawn(look, self.unknowns.on_time(look.time) if only_events else look.time)
-        terms, guidance = self.scene.idleness(step), self.guidance(step)
+        terms, guidance = self.scene.opacity_scale_penalty(step), self.guidance(step)
         if isinstance(frames, Pixels):
             blurred = self._exposed(self._mean(light, batch.get("rest")), frames.frame[:, 0, 0])
             terms["blur"] = (self.tone.encode(blurred) - frames.value).abs().mean()
@@ -207,7 +209,7 @@ class SplatModel(nn.Module):
 
     def through(self, camera: Camera) -> "OtherLens":
         """The same scene, seen by another camera than the capture's."""
-        return OtherLens(self.scene, camera)
+        return WithCamera(self.scene, camera)
 
     def render(self, rays: Rays) -> Radiance:
         """Not possible: Gaussians are drawn as whole views.
@@ -221,7 +223,7 @@ class SplatModel(nn.Module):
             do="call draw_views",
         )
 
-    def develop(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 
@@ -240,7 +242,7 @@ class SplatModel(nn.Module):
 
 
 @dataclass(frozen=True)
-class OtherLens:
+class WithCamera:
     """A scene of Gaussians in front of a camera that did not record it."""
 
     scene: SplatScene
@@ -251,12 +253,12 @@ class OtherLens:
         return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
 
 
-def with_row_clock(capture: Capture) -> Capture:
+def align_events_to_rolling_shutter(capture: Capture) -> Capture:
     """The capture with the events that are learned from on the clock of its rolling shutter."""
     frames, events = capture.frames, capture.events
     if frames is None or events is None:
         return capture
-    return replace(capture, events=on_row_clock(events, frames.exposure.row_delay_us))
+    return replace(capture, events=on_frame_clock(events, frames.exposure.row_delay_us))
 
 
 def _motion_unknown(capture: Capture) -> bool:

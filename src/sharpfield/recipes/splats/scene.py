@@ -14,8 +14,8 @@ from sharpfield.core.rays import Radiance, Views
 from sharpfield.core.schedule import Group, Schedule, constant, exponential, scaled
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Tone
-from sharpfield.fields.gaussians.densify import Watch, densify, fade
-from sharpfield.fields.gaussians.mcmc import idleness, share_out, wander
+from sharpfield.fields.gaussians.densify import GradientStats, densify, fade
+from sharpfield.fields.gaussians.mcmc import opacity_scale_penalty, position_noise, relocate_and_add
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.rendering.splat import Splatting
 
@@ -33,9 +33,9 @@ LEAST = 2000
 SETTLED = 0.05
 """What is left of a rate at the end of the schedule, relative to where growing ended."""
 
-STEADY = constant(1.0)
+NO_COOLDOWN = constant(1.0)
 
-SHEEN_SLOWER = 5
+SH_REST_SLOWER = 5
 """How much slower colours learn what changes with the direction."""
 
 
@@ -112,14 +112,14 @@ class SplatScene(nn.Module):
         self.options, self.capture, self.seed = options, capture, seed
         self.budget = budget_of(options, capture)
         self.gaussians = start
-        self.watch = Watch(len(self.gaussians)) if options.growth == "classic" else None
+        self.watch = GradientStats(len(self.gaussians)) if options.growth == "classic" else None
         self.splatting = Splatting(
             capture.camera, tone.decode, options.background, options.antialiased
         )
         self.last_growth = int(options.grow_until * steps)
         rates = options.rates
         self.means_rate = exponential(rates.means, rates.means / 100, until=max(steps, 1))
-        self.settling = settling(self.last_growth, steps)
+        self.cooldown = cooldown(self.last_growth, steps)
         self.noticed: tuple[Tensor, tuple[int, int]] | None = None
 
     def draw(self, views: Views) -> Radiance:
@@ -131,12 +131,14 @@ class SplatScene(nn.Module):
             self.noticed = shift, views.size
         return self.splatting(self.gaussians, views, shift)
 
-    def idleness(self, step: int) -> Terms:
+    def opacity_scale_penalty(self, step: int) -> Terms:
         """What frees Gaussians of little use, as long as they may move to better places."""
         markov = self.options.growth == "markov"
         if not markov or self.options.idle == 0 or step >= self.last_growth:
             return {}
-        return {"idle": self.options.idle * torch.stack(idleness(self.gaussians)).sum()}
+        return {
+            "idle": self.options.idle * torch.stack(opacity_scale_penalty(self.gaussians)).sum()
+        }
 
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         """What becomes of the Gaussians after a step."""
@@ -149,7 +151,7 @@ class SplatScene(nn.Module):
     def groups(self) -> list[Group]:
         """Parameters with their rates."""
         rates = self.options.rates
-        return gaussian_groups(self.gaussians, rates, self.means_rate, self.settling)
+        return gaussian_groups(self.gaussians, rates, self.means_rate, self.cooldown)
 
     def _share_out(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         if step >= self.last_growth:
@@ -158,10 +160,14 @@ class SplatScene(nn.Module):
         made = generator(self.seed, step, "growth", own.means.device)
         if options.noise > 0:
             with torch.no_grad():
-                own.means.add_(wander(own, self.means_rate(step), made, noise=options.noise))
+                own.means.add_(
+                    position_noise(own, self.means_rate(step), made, noise=options.noise)
+                )
         if not self._round(step):
             return []
-        growth = share_out(own.log_scales, own.opacity_logits, budget=self.budget, generator=made)
+        growth = relocate_and_add(
+            own.log_scales, own.opacity_logits, budget=self.budget, generator=made
+        )
         return [] if growth is None else [(own, growth)]
 
     def _densify(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
@@ -177,7 +183,7 @@ class SplatScene(nn.Module):
         if (step + 1) % (FADE_ROUNDS * self.options.grow_every) == 0:
             return [(own, fade(own.opacity_logits))]
         made = generator(self.seed, step, "growth", own.means.device)
-        growth = densify(own, self.watch.wish, EXTENT, budget=self.budget, generator=made)
+        growth = densify(own, self.watch.mean_grad, EXTENT, budget=self.budget, generator=made)
         return [] if growth is None else [(own, growth), (self.watch, self.watch.anew(growth))]
 
     def _round(self, step: int) -> bool:
@@ -190,15 +196,15 @@ def budget_of(options: GaussianOptions, capture: Capture) -> int:
     return options.budget or max(round(width * height * options.density), LEAST)
 
 
-def settling(begin: int, steps: int, *, left: float = SETTLED) -> Schedule:
+def cooldown(begin: int, steps: int, *, left: float = SETTLED) -> Schedule:
     """1, and from a step on down to what is left of it at the end."""
     if begin >= steps:
-        return STEADY
+        return NO_COOLDOWN
     return exponential(1.0, left, begin=begin, until=steps)
 
 
 def gaussian_groups(
-    own: Gaussians, rates: Rates, means_rate: Schedule, settle: Schedule = STEADY
+    own: Gaussians, rates: Rates, means_rate: Schedule, settle: Schedule = NO_COOLDOWN
 ) -> list[Group]:
     """Parameters of Gaussians with their rates, all of which fall as `settle` does."""
     named = {
@@ -207,6 +213,6 @@ def gaussian_groups(
         "scales": (own.log_scales, scaled(settle, rates.log_scales)),
         "opacities": (own.opacity_logits, scaled(settle, rates.opacities)),
         "colours": (own.base_harmonics, scaled(settle, rates.colours)),
-        "sheen": (own.higher_harmonics, scaled(settle, rates.colours / SHEEN_SLOWER)),
+        "sheen": (own.higher_harmonics, scaled(settle, rates.colours / SH_REST_SLOWER)),
     }
     return [Group(name, (parameter,), rate) for name, (parameter, rate) in named.items()]

@@ -10,7 +10,7 @@ from sharpfield.core.tone import Tone
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.initialisation.from_depth import points_on_surfaces
-from sharpfield.initialisation.posed_images import Pictures, sharp_pictures
+from sharpfield.initialisation.posed_images import Images, sharp_images
 from sharpfield.initialisation.start_points import starting_points
 from sharpfield.recipes.splats.scene import GaussianOptions, budget_of
 
@@ -45,13 +45,13 @@ def starting_gaussians(
     if capture.frames is not None and capture.depth is not None:
         start = points_on_surfaces(capture, tone, count, made, weights=weights, size=options.size)
     else:
-        pictures = (
+        images = (
             _grey(capture)
             if capture.frames is None
-            else sharp_pictures(capture, FixedThresholds(*thresholds))
+            else sharp_images(capture, FixedThresholds(*thresholds))
         )
         known = _known(capture)
-        start = starting_points(pictures, count, made, known=known, size=options.size)
+        start = starting_points(images, count, made, known=known, size=options.size)
     return Gaussians.start(
         torch.from_numpy(start.points),
         tone.encode(torch.from_numpy(start.colours)),
@@ -68,13 +68,11 @@ def _known(capture: Capture) -> np.ndarray | None:
     return points
 
 
-def _grey(capture: Capture) -> Pictures:
+def _grey(capture: Capture) -> Images:
     """What a scene looks like that only events have seen."""
     width, height = capture.camera.size
     time = torch.linspace(0, 1, PATH_VIEWS)
     poses = capture.trajectory.pose(time, torch.zeros(PATH_VIEWS, dtype=torch.int64))
     channels = 3 if capture.needed_events.coloured else 1
     light = np.full((PATH_VIEWS, height, width, channels), GREY, np.float32)
-    return Pictures(
-        capture.camera, light, poses.detach().double().numpy(), capture.near, capture.far
-    )
+    return Images(capture.camera, light, poses.detach().double().numpy(), capture.near, capture.far)

@@ -1,6 +1,6 @@
 """The frame terms shared by recipes: blur learned for each image, or along the known motion.
 
-Sharp pictures from the event double integral, as targets for single rays.
+Sharp images from the event double integral, as targets for single rays.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """EDI pictures as targets. Defaults: Ev-DeblurNeRF's synthetic recipe."""
+    """EDI images as targets. Defaults: Ev-DeblurNeRF's synthetic recipe."""
 
     weight: float = 0.01
     """Of the term at the first step; 0 leaves it out."""
@@ -42,9 +42,9 @@ class PriorOptions:
 
 
 class MiddlePrior(nn.Module):
-    """A sharp picture of each frame at the middle of its exposure, as published."""
+    """A sharp image of each frame at the middle of its exposure, as published."""
 
-    pictures: Tensor
+    images: Tensor
 
     def __init__(
         self, options: PriorOptions, capture: Capture, threshold: tuple[float, float]
@@ -53,22 +53,22 @@ class MiddlePrior(nn.Module):
         frames, thresholds = capture.needed_frames, FixedThresholds(*threshold)
         tone, linear = tone_of(frames.encoding), options.domain == "linear"
         motion = EventMotion.of(capture) if linear else None
-        pictures = torch.zeros(frames.images.shape)
+        images = torch.zeros(frames.images.shape)
         for i in capture.split.train:
             stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
             window = frames.exposure.window(int(i))
             if motion is not None:
                 middle = frames.exposure.middle_us[i : i + 1]
                 path = motion.path(window, middle, thresholds)
-                pictures[i] = latent_in_light(stored, path, 0, tone)
+                images[i] = latent_in_light(stored, path, 0, tone)
             else:
-                pictures[i] = published(stored, capture.needed_events, window, thresholds)
-        self.register_buffer("pictures", pictures, persistent=False)
+                images[i] = published(stored, capture.needed_events, window, thresholds)
+        self.register_buffer("images", images, persistent=False)
 
     def target(self, seen: Pixels) -> Float[Tensor, "b c"]:
         """Stored value a sharp pixel would have; the published one is not clipped."""
         x, y = seen.xy.long().unbind(-1)
-        return self.pictures[seen.frame, y, x]
+        return self.images[seen.frame, y, x]
 
 
 class InstantsPrior(nn.Module):
@@ -129,7 +129,7 @@ class FrameTerm(nn.Module):
         options: Counts and beginnings.
         volume: The sharp scene.
         tone: Light to stored values.
-        prior_weight: Of the sharp pictures from events, by step.
+        prior_weight: Of the sharp images from events, by step.
     """
 
     def __init__(
@@ -193,10 +193,10 @@ class KernelTerm(FrameTerm):
 
 
 class MotionTerm(FrameTerm):
-    """Blur as the mean along the known motion, with sharp pictures at every instant of it.
+    """Blur as the mean along the known motion, with sharp images at every instant of it.
 
     Before blur is modelled, each pixel is asked at one instant of its exposure alone, which costs
-    a single ray; the sharp pictures from events say what it should be.
+    a single ray; the sharp images from events say what it should be.
     """
 
     def __init__(
@@ -214,11 +214,11 @@ class MotionTerm(FrameTerm):
         self.shutter = Shutter(capture.camera, capture.trajectory, options.instants, tone)
 
     def blurred(self, step: int) -> bool:
-        """Without sharp pictures there is nothing to learn from before blur is modelled."""
+        """Without sharp images there is nothing to learn from before blur is modelled."""
         return self.prior is None or super().blurred(step)
 
     def terms(self, volume: Volume, seen: Pixels, step: int) -> Terms:
-        """Error of the blurred pixels, and of all rays against the sharp pictures."""
+        """Error of the blurred pixels, and of all rays against the sharp images."""
         if not self.blurred(step):
             return self._early(volume, seen, step)
         light = volume.sharp(self.shutter.expose(seen), step, "frames")

@@ -61,7 +61,7 @@ class VolumeOptions:
     clear_before: float = 0.0
     """In evaluation, nothing is seen up to this ray parameter (0...1); hides floaters."""
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
-    """What the heads compute in; auto takes bfloat16 where the processor has it."""
+    """What the heads compute in; auto takes bfloat16 where the CPU has it."""
 
 
 def soft(raw: torch.Tensor) -> torch.Tensor:

@@ -12,7 +12,7 @@ lower corners of the image; here x and y are as everywhere, from the upper left.
                · 12-21 x from the left · 22-30 y
 
 A *frame* of a DAVIS is read twice: every pixel after its reset, and again after its exposure; the
-picture is the difference. With a global shutter all pixels are reset before the first signal
+image is the difference. With a global shutter all pixels are reset before the first signal
 is read, and the exposure lies between these readings; with a rolling one it is that of the first
 column. Motion readings are passed over and counted.
 
@@ -31,8 +31,8 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import blocks, head
-from sharpfield.recordings.chunks import Piece, joined, known_size
-from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT2.0"
 LONGEST_HEADER, LONGEST_LINE = 2**20, 2**14
@@ -63,7 +63,7 @@ class Layout:
     path: Path
     begin: int
     size: tuple[int, int]
-    trouble: Trouble
+    trouble: ReadLog
 
     @property
     def davis(self) -> bool:
@@ -100,7 +100,7 @@ def open_aedat2(path: Path, *, size: tuple[int, int] | None = None) -> Recording
             got=f"{size[0]} x {size[1]} pixels, {chip or 'no AEChip in the header'}",
             do=f"give the size of one of the cameras known: {known}",
         )
-    layout = Layout(path, begin, size, Trouble())
+    layout = Layout(path, begin, size, ReadLog())
     return Recording(
         path,
         "AEDAT2",
@@ -147,7 +147,7 @@ def _events(layout: Layout) -> Chunks:
     return joined(_pieces(layout), layout.size, where=layout.path, trouble=layout.trouble)
 
 
-def _pieces(layout: Layout) -> Iterator[Piece]:
+def _pieces(layout: Layout) -> Iterator[RawChunk]:
     width, height = layout.size
     for address, t_us in _records(layout):
         if layout.davis:
@@ -156,7 +156,7 @@ def _pieces(layout: Layout) -> Iterator[Piece]:
         else:
             columns, count, unknown = _dvs128(address, t_us)
             layout.trouble.note("records of no known kind", unknown)
-        yield Piece(*columns)[:count]
+        yield RawChunk(*columns)[:count]
 
 
 def _triggers(layout: Layout) -> Triggers:
@@ -169,7 +169,7 @@ def _triggers(layout: Layout) -> Triggers:
 
 
 def _frames(layout: Layout) -> Iterator[Frame]:
-    """Pictures of a DAVIS, scaled to 16 bits."""
+    """Images of a DAVIS, scaled to 16 bits."""
     layout = replace(layout, trouble=layout.trouble.anew("frames"))
     reading = _Reading(layout)
     for address, t_us in _records(layout):

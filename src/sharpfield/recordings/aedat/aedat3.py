@@ -25,8 +25,8 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import head
-from sharpfield.recordings.chunks import Piece, joined, known_size
-from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE, LAST_LINE = b"#!AER-DAT3.1\r\n", b"#!END-HEADER\r\n"
 LONGEST_HEADER = 2**20
@@ -95,7 +95,7 @@ class Layout:
     path: Path
     begin: int
     source: int
-    trouble: Trouble = field(default_factory=Trouble)
+    trouble: ReadLog = field(default_factory=ReadLog)
 
 
 def open_aedat3(
@@ -160,12 +160,12 @@ def _events(layout: Layout, size: tuple[int, int]) -> Chunks:
     return joined(_pieces(layout), size, where=layout.path, trouble=layout.trouble)
 
 
-def _pieces(layout: Layout) -> Iterator[Piece]:
+def _pieces(layout: Layout) -> Iterator[RawChunk]:
     for packet in _packets(layout, POLARITY, 8):
         words = np.frombuffer(packet.data, "<u4").reshape(-1, 2)
         x, y, t_us, p, count = _columns(words, packet.since_us)
         layout.trouble.note("events marked invalid", packet.count - count)
-        yield Piece(x, y, t_us, p)[:count]
+        yield RawChunk(x, y, t_us, p)[:count]
 
 
 def _triggers(layout: Layout) -> Triggers:
@@ -191,7 +191,7 @@ def _frames(layout: Layout) -> Iterator[Frame]:
 
 
 def _frame(data: bytes, since_us: int) -> Frame | None:
-    """The picture, or None if it is not one of the whole sensor."""
+    """The image, or None if it is not one of the whole sensor."""
     info, _, _, opened, closed, width, height, left, top = FRAME_HEAD.unpack_from(data)
     channels = info >> 1 & 7
     count = width * height * channels

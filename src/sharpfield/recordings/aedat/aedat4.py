@@ -24,8 +24,8 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.aedat.flatbuffers import Table, root
 from sharpfield.recordings.bytes import Damaged, head, unpacked
-from sharpfield.recordings.chunks import Piece, joined, known_size
-from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT4.0\r\n"
 PACKINGS = ("none", "lz4", "lz4", "zstd", "zstd")
@@ -66,7 +66,7 @@ class Layout:
     end: int
     packing: str
     streams: dict[int, Stream]
-    trouble: Trouble = field(default_factory=Trouble)
+    trouble: ReadLog = field(default_factory=ReadLog)
 
 
 def open_aedat4(
@@ -196,7 +196,7 @@ def _events(layout: Layout, number: int, size: tuple[int, int]) -> Chunks:
     return joined(_pieces(layout, number), size, where=layout.path, trouble=layout.trouble)
 
 
-def _pieces(layout: Layout, number: int) -> Iterator[Piece]:
+def _pieces(layout: Layout, number: int) -> Iterator[RawChunk]:
     for table in _packets(layout, [number], "EVTS"):
         try:
             stored = table.vector(0, EVENT.itemsize)
@@ -204,7 +204,7 @@ def _pieces(layout: Layout, number: int) -> Iterator[Piece]:
             layout.trouble.note("damaged packets")
             continue
         words = np.require(np.frombuffer(stored, np.int64), requirements="A")
-        yield Piece(*_columns(words.reshape(-1, 2)))
+        yield RawChunk(*_columns(words.reshape(-1, 2)))
 
 
 def _frames(layout: Layout, number: int) -> Iterator[Frame]:
@@ -223,8 +223,8 @@ def _frames(layout: Layout, number: int) -> Iterator[Frame]:
             layout.trouble.note("frames earlier than those before them")
 
 
-def _frame(table: Table, trouble: Trouble) -> Frame | None:
-    """The picture, or None if it is not one of the whole sensor."""
+def _frame(table: Table, trouble: ReadLog) -> Frame | None:
+    """The image, or None if it is not one of the whole sensor."""
     if table.number(12, "b") in MADE_FROM_EVENTS:
         trouble.note("frames made from events")
         return None

@@ -23,10 +23,10 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import blocks, head
-from sharpfield.recordings.chunks import CHUNK, Piece, Reorder, joined, known_size
+from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
 from sharpfield.recordings.prophesee.evt_decode import is_lone, step
 from sharpfield.recordings.prophesee.header import Header, read_header, stated_size
-from sharpfield.recordings.recording import Chunks, Recording, Triggers, Trouble
+from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EVENTS, EDGES = (0, 12), 14
 """Types of records."""
@@ -60,7 +60,7 @@ def open_dat(path: Path | str, *, size: tuple[int, int] | None = None) -> Record
     stated = stated_size(header, path, size)
     size = stated or size if edges else known_size(stated, size, path)
     version = 2 if (header.number("version") or 0) >= 2 else 1
-    trouble = Trouble()
+    trouble = ReadLog()
 
     def records() -> Iterator[bytes]:
         return blocks(path, header.length + 2)
@@ -105,7 +105,9 @@ def _kind(header: Header, path: Path) -> int:
     return kind[0]
 
 
-def _pieces(data: Iterable[bytes], bits: tuple[int, int, int], trouble: Trouble) -> Iterator[Piece]:
+def _pieces(
+    data: Iterable[bytes], bits: tuple[int, int, int], trouble: ReadLog
+) -> Iterator[RawChunk]:
     room, state = Reorder(), np.zeros(3, np.int64)
     rest = b""
     for block in chain(data, [None]):

@@ -14,7 +14,7 @@ from jaxtyping import Int64
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.bytes import blocks
-from sharpfield.recordings.chunks import CHUNK, Piece, Reorder, joined, known_size
+from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
 from sharpfield.recordings.prophesee.evt_decode import (
     NO_ROW,
     REMEMBERED,
@@ -29,7 +29,7 @@ from sharpfield.recordings.prophesee.evt_decode import (
     decode_evt21,
 )
 from sharpfield.recordings.prophesee.header import Header, read_header, stated_size
-from sharpfield.recordings.recording import Chunks, Recording, Triggers, Trouble
+from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EDGES = 4096
 """Trigger edges taken over at once."""
@@ -88,7 +88,7 @@ def open_evt(
     size = known_size(stated_size(header, path, size), size, path)
     origin_us = header.number("time_origin_us") or 0
     bayer = header.fields.get("bayer", "")
-    trouble = Trouble()
+    trouble = ReadLog()
 
     def words() -> Iterator[bytes]:
         return blocks(path, header.length)
@@ -120,7 +120,7 @@ def decoded(
     size: tuple[int, int],
     *,
     where: object,
-    trouble: Trouble,
+    trouble: ReadLog,
 ) -> Chunks:
     """Events of an encoded stream, cut into blocks anywhere.
 
@@ -140,7 +140,7 @@ def decoded(
 
 def trigger_edges(encoding: str, data: Iterable[bytes], *, where: object) -> Triggers:
     """Edges on the trigger inputs, of a stream as `decoded` takes it, in the order of time."""
-    decoder = _Decoder(ENCODINGS[encoding], where, Trouble())
+    decoder = _Decoder(ENCODINGS[encoding], where, ReadLog())
     for _ in decoder.pieces(data):
         pass
     edges = np.concatenate([np.empty((0, 3), np.int64), *decoder.edges])
@@ -151,7 +151,7 @@ def trigger_edges(encoding: str, data: Iterable[bytes], *, where: object) -> Tri
 class _Decoder:
     """What goes on from block to block."""
 
-    def __init__(self, encoding: Encoding, where: object, trouble: Trouble) -> None:
+    def __init__(self, encoding: Encoding, where: object, trouble: ReadLog) -> None:
         self._encoding, self._where, self._trouble = encoding, where, trouble
         self._state = np.zeros(REMEMBERED, np.int64)
         self._state[ROW] = NO_ROW
@@ -162,7 +162,7 @@ class _Decoder:
         self._found = np.empty((EDGES, 3), np.int64)
         self.edges: list[Int64[np.ndarray, "n 3"]] = []
 
-    def pieces(self, data: Iterable[bytes]) -> Iterator[Piece]:
+    def pieces(self, data: Iterable[bytes]) -> Iterator[RawChunk]:
         """Decode it all."""
         for block in data:
             self._take(block)
@@ -188,7 +188,7 @@ class _Decoder:
             words = words >> np.uint64(32) | words << np.uint64(32)
         self._words = np.concatenate([self._words, words]) if len(self._words) else words
 
-    def _decode(self, *, last: bool) -> Iterator[Piece]:
+    def _decode(self, *, last: bool) -> Iterator[RawChunk]:
         """Decode the words that are there, and yield whenever the room is full."""
         decode, room = self._encoding.decode, self._room
         while True:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from sharpfield.recordings.bytes import Bytes, Damaged
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.recording import ReadLog
 
 TEXT = 2**16
 """Bytes of the longest text in a message."""
@@ -49,7 +49,7 @@ class Bag:
     path: Path
     layout: str
     topics: dict[str, Topic]
-    messages: Callable[[Collection[str], Trouble], Iterator[Message]]
+    messages: Callable[[Collection[str], ReadLog], Iterator[Message]]
     """Those of some topics, in the order recorded; each call starts anew."""
 
 

@@ -20,8 +20,8 @@ from jaxtyping import Shaped
 from numba import njit
 
 from sharpfield.recordings.bytes import Damaged
-from sharpfield.recordings.chunks import CHUNK, Piece, Reorder
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder
+from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import Fields, Message, Topic
 
 ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
@@ -65,7 +65,7 @@ def start(fields: Fields) -> Start:
     return Start(stamp_ns, (width, height))
 
 
-def event_arrays(messages: Iterable[Message], topic: Topic, trouble: Trouble) -> Iterator[Piece]:
+def event_arrays(messages: Iterable[Message], topic: Topic, trouble: ReadLog) -> Iterator[RawChunk]:
     """The events of consecutive messages of `ARRAYS`, decoded right to where they stay."""
     room = Reorder()
     for message in messages:
@@ -155,7 +155,7 @@ PIXELS: dict[str, tuple[type[np.unsignedinteger], int, str]] = {
 
 
 class Image(NamedTuple):
-    """A picture and its time."""
+    """A image and its time."""
 
     stamp_ns: int
     image: Shaped[np.ndarray, "h w *c"]
@@ -163,7 +163,7 @@ class Image(NamedTuple):
 
 
 def image(message: Message, topic: Topic) -> Image:
-    """The picture of a message.
+    """The image of a message.
 
     Raises:
         Damaged: It is torn, or its pixels are of no known type.

@@ -16,12 +16,12 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from sharpfield.recordings.chunks import Piece
+from sharpfield.recordings.chunks import RawChunk
 
 ENCODINGS = ("libcaer_cmp", "libcaer", "mono")
 
 
-def decode(encoding: str, payload: memoryview, base_ns: int) -> Piece:
+def decode(encoding: str, payload: memoryview, base_ns: int) -> RawChunk:
     """The events of a packet.
 
     Args:
@@ -32,9 +32,9 @@ def decode(encoding: str, payload: memoryview, base_ns: int) -> Piece:
     if encoding == "libcaer_cmp":
         words = np.frombuffer(payload, "<u2", len(payload) // 2)
         *columns, count = _compressed(words, base_ns, _most(words))
-        return Piece(*columns)[:count]
+        return RawChunk(*columns)[:count]
     words = np.frombuffer(payload, "<u4", len(payload) // 8 * 2).reshape(-1, 2)
-    return Piece(*(_plain if encoding == "libcaer" else _mono)(words, base_ns))
+    return RawChunk(*(_plain if encoding == "libcaer" else _mono)(words, base_ns))
 
 
 @njit(cache=True, nogil=True)

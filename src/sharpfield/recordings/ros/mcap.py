@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import LIMIT, Bytes, Damaged, head, unpacked
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import Bag, Message, Read, Topic, of_file, of_part, topic_of
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -32,9 +32,9 @@ def open_mcap(path: Path) -> Bag:
     """
     if head(path, len(MAGIC)) != MAGIC:
         raise CaptureError("the file is no MCAP", where=path)
-    channels = _summarised(path) or _channels(_records(path, len(MAGIC), Trouble()))
+    channels = _summarised(path) or _channels(_records(path, len(MAGIC), ReadLog()))
 
-    def messages(wanted: Collection[str], trouble: Trouble) -> Iterator[Message]:
+    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
         numbers = {n: name for n, (name, _) in channels.items() if name in wanted}
         for kind, content in _records(path, len(MAGIC), trouble):
             if kind == MESSAGE and len(content) >= 22:
@@ -55,7 +55,7 @@ def _summarised(path: Path) -> Channels:
         kind, _, start = struct.unpack("<BQQ", file.read(17))
     if kind != FOOTER or not len(MAGIC) < start < length:
         return {}
-    return _channels(_records(path, start, Trouble()))
+    return _channels(_records(path, start, ReadLog()))
 
 
 def _channels(records: Iterator[Record]) -> Channels:
@@ -78,7 +78,7 @@ def _channels(records: Iterator[Record]) -> Channels:
     return found
 
 
-def _records(path: Path, begin: int, trouble: Trouble) -> Iterator[Record]:
+def _records(path: Path, begin: int, trouble: ReadLog) -> Iterator[Record]:
     """Records outside and inside of chunks, up to the end of the data or of the summary."""
     length = path.stat().st_size
     with path.open("rb") as file:

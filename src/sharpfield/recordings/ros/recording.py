@@ -25,7 +25,7 @@ from sharpfield.recordings.bytes import Damaged, head
 from sharpfield.recordings.chunks import joined, known_size
 from sharpfield.recordings.prophesee.evt import ENCODINGS as EVT_ENCODINGS
 from sharpfield.recordings.prophesee.evt import decoded, trigger_edges
-from sharpfield.recordings.recording import Chunks, Frame, Recording, Triggers, Trouble
+from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 from sharpfield.recordings.ros import libcaer, mcap
 from sharpfield.recordings.ros import ros1 as ros1_bag
 from sharpfield.recordings.ros import sqlite as sqlite_bag
@@ -97,7 +97,7 @@ def open_rosbag(
         CaptureError: It is no bag, holds neither events nor images, or several topics of either
             and none was chosen.
     """
-    bag, trouble = _opened(path), Trouble()
+    bag, trouble = _opened(path), ReadLog()
     events = _chosen(bag, EVENT_TYPES, topic, "topic")
     images = None if image_topic == "" else _chosen(bag, IMAGE_TYPES, image_topic, "image_topic")
     if events is None and images is None:
@@ -150,7 +150,7 @@ def _number(path: Path) -> tuple[int, str]:
 
 
 def _chained(path: Path, bags: list[Bag]) -> Bag:
-    def messages(wanted: Collection[str], trouble: Trouble) -> Iterator[Message]:
+    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
         return (message for bag in bags for message in bag.messages(wanted, trouble))
 
     topics = {name: topic for bag in bags for name, topic in bag.topics.items()}
@@ -190,7 +190,7 @@ def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> Source:
         CaptureError: They are encoded in an unknown way, or do not tell the size.
     """
     known, stated, encoding = bag.topics[topic], None, ""
-    for message in islice(bag.messages([topic], Trouble()), AHEAD):
+    for message in islice(bag.messages([topic], ReadLog()), AHEAD):
         try:
             width, height = start(Fields(message, known)).size
             encoding = event_packet(message, known).encoding if known.kind in PACKETS else ""
@@ -214,16 +214,16 @@ def _shift_us(source: Source) -> int:
     if source.encoding not in SENSOR_CLOCKS:
         return 0
     packets: list[Packet] = []
-    for packet in islice(_packets(source, Trouble()), AHEAD):
+    for packet in islice(_packets(source, ReadLog()), AHEAD):
         packets.append(packet)
         # The times of a packet may need what came before it.
-        first = next(_decoded(source, iter(packets), Trouble()), None)
+        first = next(_decoded(source, iter(packets), ReadLog()), None)
         if first is not None and len(first):
             return (packet.stamp_ns + 500) // 1000 - int(first.t_us[0])
     return 0
 
 
-def _events(source: Source, trouble: Trouble) -> Chunks:
+def _events(source: Source, trouble: ReadLog) -> Chunks:
     trouble = trouble.anew("events")
     if not source.encoding:
         messages = source.bag.messages([source.topic], trouble)
@@ -233,7 +233,7 @@ def _events(source: Source, trouble: Trouble) -> Chunks:
     return (replace(chunk, t_us=chunk.t_us + source.shift_us) for chunk in chunks)
 
 
-def _decoded(source: Source, packets: Iterator[Packet], trouble: Trouble) -> Chunks:
+def _decoded(source: Source, packets: Iterator[Packet], trouble: ReadLog) -> Chunks:
     """Events by the clock of the payload."""
     where, encoding = source.bag.path, source.encoding
     if encoding in EVT_ENCODINGS:
@@ -244,12 +244,12 @@ def _decoded(source: Source, packets: Iterator[Packet], trouble: Trouble) -> Chu
 
 
 def _triggers(source: Source) -> Triggers:
-    payloads = (bytes(packet.payload) for packet in _packets(source, Trouble()))
+    payloads = (bytes(packet.payload) for packet in _packets(source, ReadLog()))
     found = trigger_edges(source.encoding, payloads, where=source.bag.path)
     return replace(found, t_us=found.t_us + source.shift_us)
 
 
-def _packets(source: Source, trouble: Trouble) -> Iterator[Packet]:
+def _packets(source: Source, trouble: ReadLog) -> Iterator[Packet]:
     topic = source.bag.topics[source.topic]
     for message in source.bag.messages([source.topic], trouble):
         try:
@@ -265,10 +265,10 @@ def _packets(source: Source, trouble: Trouble) -> Iterator[Packet]:
 
 def _bayer(bag: Bag, topic: str) -> str:
     """The tile of the first image."""
-    return next((found.bayer for found in _images(bag, topic, Trouble())), "")
+    return next((found.bayer for found in _images(bag, topic, ReadLog())), "")
 
 
-def _frames(bag: Bag, topic: str, exposure_us: int, trouble: Trouble) -> Iterator[Frame]:
+def _frames(bag: Bag, topic: str, exposure_us: int, trouble: ReadLog) -> Iterator[Frame]:
     trouble = trouble.anew("frames")
     ends = _exposure_ends(bag, f"{topic}/exposure", trouble)
     before = None
@@ -281,7 +281,7 @@ def _frames(bag: Bag, topic: str, exposure_us: int, trouble: Trouble) -> Iterato
         yield Frame(found.image, opened, max(opened, ends.get(opened, opened + exposure_us)))
 
 
-def _images(bag: Bag, topic: str, trouble: Trouble) -> Iterator[Image]:
+def _images(bag: Bag, topic: str, trouble: ReadLog) -> Iterator[Image]:
     for message in bag.messages([topic], trouble):
         try:
             found = image(message, bag.topics[topic])
@@ -291,7 +291,7 @@ def _images(bag: Bag, topic: str, trouble: Trouble) -> Iterator[Image]:
         yield found
 
 
-def _exposure_ends(bag: Bag, topic: str, trouble: Trouble) -> dict[int, int]:
+def _exposure_ends(bag: Bag, topic: str, trouble: ReadLog) -> dict[int, int]:
     """When the exposure ended that began at a time; empty if the bag does not say."""
     ends: dict[int, int] = {}
     if topic not in bag.topics or bag.topics[topic].kind != EXPOSURE_TYPE:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import LIMIT, Bytes, Damaged, head, unpacked
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import Bag, Message, Read, Topic, of_file, of_part, topic_of
 
 FIRST_LINE = b"#ROSBAG V2.0\n"
@@ -49,7 +49,7 @@ def open_ros1_bag(path: Path) -> Bag:
     connections = _indexed(path) or _scanned(path)
     topics = dict(connections.values())
 
-    def messages(wanted: Collection[str], trouble: Trouble) -> Iterator[Message]:
+    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
         numbers = {n: name for n, (name, _) in connections.items() if name in wanted}
         return _messages(path, numbers, trouble)
 
@@ -80,7 +80,7 @@ def _indexed(path: Path) -> Connections:
 def _scanned(path: Path) -> Connections:
     """Connections as they come by."""
     found: Connections = {}
-    for read, record in _all_records(path, Trouble()):
+    for read, record in _all_records(path, ReadLog()):
         if record.kind == CONNECTION:
             try:
                 found.update([_connection(read, record)])
@@ -96,7 +96,7 @@ def _connection(read: Read, record: _Record) -> tuple[int, tuple[str, Topic]]:
     return record.number(b"conn", 4), (name, topic_of(kind, cdr=False))
 
 
-def _messages(path: Path, topics: dict[int, str], trouble: Trouble) -> Iterator[Message]:
+def _messages(path: Path, topics: dict[int, str], trouble: ReadLog) -> Iterator[Message]:
     for read, record in _all_records(path, trouble):
         if record.kind == MESSAGE and (name := topics.get(record.number(b"conn", 4))) is not None:
             time = record.number(b"time", 8)
@@ -104,7 +104,7 @@ def _messages(path: Path, topics: dict[int, str], trouble: Trouble) -> Iterator[
             yield Message(name, logged_ns, read(record.place, record.size))
 
 
-def _all_records(path: Path, trouble: Trouble) -> Iterator[tuple[Read, _Record]]:
+def _all_records(path: Path, trouble: ReadLog) -> Iterator[tuple[Read, _Record]]:
     """Records outside and inside of chunks, with what to read their data from."""
     length = path.stat().st_size
     with path.open("rb") as file:

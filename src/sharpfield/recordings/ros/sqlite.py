@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import Bytes, Damaged, head, unpacked
-from sharpfield.recordings.recording import Trouble
+from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import Bag, Message, topic_of
 
 MAGIC = b"SQLite format 3\0"
@@ -37,7 +37,7 @@ def open_sqlite_bag(path: Path) -> Bag:
     topics = {str(name): topic_of(str(kind), cdr=True) for _, name, kind in rows}
     numbers = {number: str(name) for number, name, _ in rows}
 
-    def messages(wanted: Collection[str], trouble: Trouble) -> Iterator[Message]:
+    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
         chosen = [number for number, name in numbers.items() if name in wanted]
         marks = ", ".join("?" * len(chosen))
         # In the order of recording: by time would need an index, which is damaged more easily.

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int64, Shaped
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.chunks import expect_inside
-from sharpfield.recordings.recording import Chunks, Recording, Trouble
+from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.storage.event_columns import UNITS
 from sharpfield.storage.event_file import CHUNK, EventFile
 
@@ -29,7 +29,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
         CaptureError: The file cannot be opened, or the unit of its times or the size of its
             sensor is not known.
     """
-    trouble = Trouble()
+    trouble = ReadLog()
     with open_file() as file:
         _expect_unit(file)
         _expect_size(file)
@@ -46,7 +46,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
     )
 
 
-def _chunks(file: EventFile, trouble: Trouble, *, whole: bool) -> Chunks:
+def _chunks(file: EventFile, trouble: ReadLog, *, whole: bool) -> Chunks:
     before: int | None = None
     outside = 0
     for first in range(0, len(file), CHUNK):

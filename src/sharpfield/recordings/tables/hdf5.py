@@ -285,7 +285,7 @@ def _m3ed_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
     images, times = _filled(file, f"ovc/{camera}/data"), _filled(file, "ovc/ts")
     if images.ndim != 4 or images.shape[3] not in (1, 3):
         raise CaptureError(
-            "frames must be pictures of one or three channels",
+            "frames must be images of one or three channels",
             where=f"{file.filename}, {images.name}",
             got=images,
         )

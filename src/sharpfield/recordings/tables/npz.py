@@ -12,7 +12,7 @@ polarities take two values. Where that leaves a choice, the caller is asked.
 Source: Gehrig et al., *Video to Events* (CVPR 2020); Rudnev et al., *EventNeRF* (CVPR 2023); Low
 and Lee, *Robust e-NeRF* (ICCV 2023); Li et al., *BeNeRF* (ECCV 2024).
 
-The data sets N-MNIST and N-Caltech101: five bytes per event, one small file per picture.
+The data sets N-MNIST and N-Caltech101: five bytes per event, one small file per image.
 
     x, 1 byte; y, 1 byte; polarity, 1 bit; time in us, 23 bits, most significant byte first
 
@@ -35,8 +35,8 @@ from jaxtyping import Shaped
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import blocks, head
-from sharpfield.recordings.chunks import Piece, joined, known_size
-from sharpfield.recordings.recording import Chunks, Recording, Trouble
+from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.recordings.tables.columns import recording_of
 from sharpfield.storage.event_columns import ZippedColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
@@ -114,7 +114,7 @@ def open_npz_folder(
         unit = "ns"
     opened = [open_npz(file, unit=unit, size=size) for file in files]
 
-    trouble = Trouble()
+    trouble = ReadLog()
 
     def events() -> Chunks:
         before: int | None = None
@@ -294,7 +294,7 @@ RECORD = 5
 """Bytes of an event."""
 
 SIZES = {"nmnist": (34, 34), "ncaltech101": (240, 180)}
-"""Width and height of each data set; pictures of N-Caltech101 differ, none is larger."""
+"""Width and height of each data set; images of N-Caltech101 differ, none is larger."""
 
 NO_ROW, PAUSE_US = 240, 2**13
 """Row of a record that is no event, and the time it stands for."""
@@ -311,14 +311,14 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
         CaptureError: It is no such file, or the size is not given.
     """
     path = Path(path)
-    trouble = Trouble()
+    trouble = ReadLog()
     if len(head(path, RECORD)) < RECORD:
         raise CaptureError(
             "the file holds no event", where=path, got="less than 5 bytes", do="copy it again"
         )
     size = known_size(None, size, path)
 
-    def pieces(noted: Trouble) -> Iterator[Piece]:
+    def pieces(noted: ReadLog) -> Iterator[RawChunk]:
         rest, paused_us = b"", 0
         for block in chain(blocks(path), [b""]):
             rest += block
@@ -329,7 +329,7 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
             paused_us = int(pauses[-1]) if len(pauses) else paused_us
             t_us = ((high & 0x7F) << 16 | middle << 8 | low) + pauses
             p = np.where(high >> 7, 1, -1).astype(np.int8)
-            yield Piece(x.astype(np.uint16), y.astype(np.uint16), t_us, p)[y != NO_ROW]
+            yield RawChunk(x.astype(np.uint16), y.astype(np.uint16), t_us, p)[y != NO_ROW]
         noted.note("torn records", int(len(rest) > 0))
 
     def events() -> Chunks:

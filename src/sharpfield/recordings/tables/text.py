@@ -26,8 +26,8 @@ import numpy as np
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.bytes import BLOCK, blocks, head
-from sharpfield.recordings.chunks import CHUNK, Piece, Reorder, joined, known_size
-from sharpfield.recordings.recording import Chunks, Recording, Trouble
+from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.recordings.tables.text_decode import (
     BAD,
     BAD_LINE,
@@ -71,7 +71,7 @@ UNREADABLE = (
 )
 """What an archive that is damaged, locked or packed in an odd way raises."""
 
-Blocks = Callable[[Trouble], Iterator[bytes]]
+Blocks = Callable[[ReadLog], Iterator[bytes]]
 """Starts reading the text anew, and notes what is damaged."""
 
 
@@ -106,9 +106,9 @@ def open_text(
         OptionError: There is no such unit, or no such order of columns.
     """
     path = Path(path)
-    trouble = Trouble()
+    trouble = ReadLog()
     read = _zipped(path) if head(path, 4) == b"PK\x03\x04" else lambda noted: blocks(path)
-    start = next(read(Trouble()), b"")
+    start = next(read(ReadLog()), b"")
     begin = _beginning(start[:WHOLE_HEAD])
     order = begin.columns or columns or USUAL
     if sorted(order) != sorted(USUAL):
@@ -175,8 +175,8 @@ def _unit(time: str, path: Path) -> str:
 
 
 def _pieces(
-    data: Iterator[bytes], layout: np.ndarray, path: Path, trouble: Trouble
-) -> Iterator[Piece]:
+    data: Iterator[bytes], layout: np.ndarray, path: Path, trouble: ReadLog
+) -> Iterator[RawChunk]:
     room, state = Reorder(), np.zeros(REMEMBERED, np.int64)
     rest, told = b"", 0
     for block in chain(data, [None]):
@@ -246,7 +246,7 @@ def _zipped(path: Path) -> Blocks:
             "cannot read the archive", where=path, got=error, do="copy or pack it again"
         ) from None
 
-    def read(noted: Trouble) -> Iterator[bytes]:
+    def read(noted: ReadLog) -> Iterator[bytes]:
         try:
             with zipfile.ZipFile(path) as archive, archive.open(named[0]) as file:
                 while block := file.read(BLOCK):

@@ -171,8 +171,8 @@ def exposure_for(
     return exposure_us
 
 
-def instants(exposure: Exposure, frame: int, *, pictures: int) -> Int64[np.ndarray, "k"]:
+def instants(exposure: Exposure, frame: int, *, images: int) -> Int64[np.ndarray, "k"]:
     """Times at which to draw one exposure: both ends, the middle, and evenly between."""
     opens, closes = exposure.window(frame)
-    even = np.rint(np.linspace(opens, closes, pictures)).astype(np.int64)
+    even = np.rint(np.linspace(opens, closes, images)).astype(np.int64)
     return np.unique(np.append(even, exposure.middle_us[frame]))

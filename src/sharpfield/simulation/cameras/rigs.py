@@ -26,7 +26,7 @@ RING_FOCAL = 50 / 36
 
 
 @dataclass(frozen=True)
-class Standing:
+class StillCamera:
     """A camera that stands still."""
 
     pose: Float64[np.ndarray, "3 4"]
@@ -37,7 +37,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Carried:
+class CarriedCamera:
     """A camera that moves about a place, as told by a path of small movements."""
 
     base: Float64[np.ndarray, "3 4"]
@@ -61,7 +61,7 @@ class Views:
 def ring_pose(
     azimuth_deg: Real, *, elevation_deg: Real = ELEVATION_DEG, radius: Real = RADIUS
 ) -> Float64[np.ndarray, "3 4"]:
-    """World-from-camera of a camera that looks at the origin, z up in the picture; OpenCV axes."""
+    """World-from-camera of a camera that looks at the origin, z up in the image; OpenCV axes."""
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
     outwards = np.array(
         [
@@ -91,8 +91,8 @@ def ring(views: int, *, held_out: int = 0) -> Views:
     step = 360 / views
     between = np.arange(held_out) * views // max(held_out, 1) + 0.5
     return Views(
-        [Standing(ring_pose(FIRST_DEG - step * k)) for k in range(views)],
-        [Standing(ring_pose(FIRST_DEG - step * k)) for k in between],
+        [StillCamera(ring_pose(FIRST_DEG - step * k)) for k in range(views)],
+        [StillCamera(ring_pose(FIRST_DEG - step * k)) for k in between],
     )
 
 
@@ -106,6 +106,6 @@ def hand_held(name: str = "glide", *, seed: int = 0, held_out: int = 0) -> Views
     """
     aside = np.linspace(-20, 20, held_out) if held_out > 1 else np.zeros(held_out)
     return Views(
-        [Carried(ring_pose(FIRST_DEG), motion(name, seed))],
-        [Standing(ring_pose(FIRST_DEG + angle)) for angle in aside],
+        [CarriedCamera(ring_pose(FIRST_DEG), motion(name, seed))],
+        [StillCamera(ring_pose(FIRST_DEG + angle)) for angle in aside],
     )

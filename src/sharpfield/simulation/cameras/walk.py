@@ -27,7 +27,7 @@ PAUSES = 0.2
 
 
 @dataclass(frozen=True)
-class Walk:
+class RoomWalk:
     """A camera path through the room, see `walk`."""
 
     phase: Float64[np.ndarray, "m"]
@@ -73,7 +73,7 @@ class Walk:
         return across + aside, pitch, 0.04 * np.sin(3 * turns + self.bend[5])
 
 
-def walk(duration_us: int, seed: int) -> Walk:
+def walk(duration_us: int, seed: int) -> RoomWalk:
     """A walk of a given length in time, drawn from a seed; a longer one begins like a shorter."""
     draw = numpy_generator(seed, 0, "walk")
     bend = draw.uniform(0, 2 * np.pi, 6)
@@ -90,7 +90,7 @@ def walk(duration_us: int, seed: int) -> Walk:
     pace = _smoothly(1e-6 * TICK_US * ticks / STRETCH_S, speed)
     step = 1e-6 * TICK_US / LOOP_S * pace
     phase = start + np.concatenate([[0.0], np.cumsum(0.5 * (step[1:] + step[:-1]))])
-    return Walk(phase, pace, bend, hertz, tremor, tremor_phase)
+    return RoomWalk(phase, pace, bend, hertz, tremor, tremor_phase)
 
 
 def _smoothly(

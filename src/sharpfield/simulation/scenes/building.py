@@ -59,7 +59,7 @@ def rectangle(
     turn: Vector = (0.0, 0.0, 0.0),
     throws_shadow: bool = True,
 ) -> Surface:
-    """A flat picture of `size` (width, height), upright and facing the camera unless turned."""
+    """A flat image of `size` (width, height), upright and facing the camera unless turned."""
     half = (size[0] / 2, size[1] / 2, 0.0)
     return Surface(RECTANGLE, centre, half, paint, turn, throws_shadow)
 

@@ -79,14 +79,14 @@ def _shell() -> list[Surface]:
     rug = Paint("#7d2f3a", "#e8c98f", "#2d4b73", TILES, 1.9, 2)
     poster = Paint("#24476b", "#f6e7b4", text="LIGHT\nAND\nTIME")
     sign = Paint("#fff6e0", "#b0273a", text="SHARP\nFIELD")
-    picture = Paint("#fbf6ea", "#1d2b53", text="BLUR\nIS\nDATA")
+    image = Paint("#fbf6ea", "#1d2b53", text="BLUR\nIS\nDATA")
     leaves = Paint("#1f4d2b", "#86b94e", "#e5d36b", LEAVES, 6.0, 3)
     door = Paint("#6f4a2d", "#8f6844", texture=WOOD, cells=3.0, seed=8)
     hung = [
         rectangle((0, FLOOR - 0.005, 0.05), (3.0, 2.2), rug, turn=FLAT, throws_shadow=False),
         rectangle((-0.2, -0.25, 2.46), (1.3, 1.0), poster, throws_shadow=False),
         rectangle((1.9, -0.2, -2.46), (1.2, 0.8), sign, turn=(0, 180, 0), throws_shadow=False),
-        rectangle((2.96, -0.15, -0.3), (1.0, 1.1), picture, turn=(0, 90, 0), throws_shadow=False),
+        rectangle((2.96, -0.15, -0.3), (1.0, 1.1), image, turn=(0, 90, 0), throws_shadow=False),
         rectangle((-2.96, -0.2, 0.3), (1.2, 1.0), leaves, turn=(0, -90, 0), throws_shadow=False),
         rectangle((0.3, 0.45, -2.47), (0.9, 2.1), door, turn=(0, 180, 0), throws_shadow=False),
     ]

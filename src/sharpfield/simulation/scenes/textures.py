@@ -2,7 +2,7 @@
 
 A texture says, at a place (u, v) on a surface, how much of a second colour (`ink`) and of a third
 (`accent`) covers the first. Every edge is as soft as the footprint of a pixel and patterns finer
-than a pixel fade to their mean, so pictures have no aliasing, and light stays a smooth function
+than a pixel fade to their mean, so images have no aliasing, and light stays a smooth function
 of the ray, however small the image.
 
 Everything here is compiled and called once per ray; lengths are world units. It is compiled into

@@ -1,6 +1,6 @@
-"""Events from pictures: exact crossing times, linear in log intensity between two instants.
+"""Events from images: exact crossing times, linear in log intensity between two instants.
 
-Times are integer ns inside and us in the stream, rounded to the nearest. Pictures are fed one
+Times are integer ns inside and us in the stream, rounded to the nearest. Images are fed one
 after the other, so a recording of any length needs the memory of one gap between two of them.
 The result does not depend on how a straight piece of log intensity is cut into gaps.
 """
@@ -66,7 +66,7 @@ class EventPixels:
         )
 
     def see(self, rgb: Float32[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w"], t_ns: int) -> Gap:
-        """Events since the last picture; none for the first.
+        """Events since the last image; none for the first.
 
         Args:
             rgb: Linear light, colour or grey.
@@ -84,7 +84,7 @@ class EventPixels:
             return Gap(*(np.zeros(0, d) for d in (np.int16, np.int16, np.int64, np.int8)))
         if t_ns <= self._last_ns:
             raise OptionError(
-                "pictures must come in the order of time", got=f"{self._last_ns} ns, {t_ns} ns"
+                "images must come in the order of time", got=f"{self._last_ns} ns, {t_ns} ns"
             )
         start_ns, self._last_ns = self._last_ns, t_ns
         span_ns, before = (start_ns, t_ns), self._level
@@ -100,8 +100,8 @@ class EventPixels:
         return _ordered(self._spikes, count, span_ns, self._size[1])
 
     def thresholds(self) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-        """Contrast thresholds of each pixel, ON and OFF; known once a picture was seen."""
-        assert self.pixels is not None, "thresholds are drawn when the first picture is seen"
+        """Contrast thresholds of each pixel, ON and OFF; known once a image was seen."""
+        assert self.pixels is not None, "thresholds are drawn when the first image is seen"
         on, off = self.pixels.on.reshape(self._size), self.pixels.off.reshape(self._size)
         return on.astype(np.float32), off.astype(np.float32)
 
@@ -139,7 +139,7 @@ def watch(
     shortest_us: int = 250,
     floor: float = 1e-5,
 ) -> Iterator[tuple[int, Float32[np.ndarray, "h w 3"]]]:
-    """Pictures at some instants, and between them wherever a pixel changes too much in one gap.
+    """Images at some instants, and between them wherever a pixel changes too much in one gap.
 
     Args:
         render: Linear light at a time in us; must be a pure function.

@@ -38,10 +38,10 @@ class FrameSensor:
 
 
 class Exposing:
-    """Light gathered by many exposures from pictures that are shown one after the other.
+    """Light gathered by many exposures from images that are shown one after the other.
 
-    Between two pictures light goes straight, so the mean is exact for light that does; an exposure
-    of no length takes the picture at its instant.
+    Between two images light goes straight, so the mean is exact for light that does; an exposure
+    of no length takes the image at its instant.
     """
 
     def __init__(
@@ -78,17 +78,17 @@ class Exposing:
         """Mean linear light of each exposure.
 
         Raises:
-            OptionError: The pictures did not cover an exposure.
+            OptionError: The images did not cover an exposure.
         """
         length = np.where(self._open == self._close, 1.0, self._close - self._open)
         short = np.abs(self._seen - length) > 1e-6 * length
         if short.any():
             i = int(np.flatnonzero(short.any(1))[0])
             raise OptionError(
-                "the pictures do not cover an exposure",
+                "the images do not cover an exposure",
                 where=f"exposure {i}",
                 got=f"{self._seen[i].min():g} of {length[i, 0]:g} us seen",
-                do="show pictures from before it opens until after it closes",
+                do="show images from before it opens until after it closes",
             )
         return self._sum / self._seen[..., None, None].astype(np.float32)
 

@@ -1,4 +1,4 @@
-"""Random motion kernels: what a shaken camera does to a picture, if it does the same everywhere.
+"""Random motion kernels: what a shaken camera does to a image, if it does the same everywhere.
 
 A kernel of *size* k is drawn on a canvas of 2k by 2k: a polyline of short steps whose headings
 stray the more, the larger the *intensity* phi; then it is shrunk to k by k. With a small phi the
@@ -33,7 +33,7 @@ class KernelRange:
     phi: tuple[float, float] = INTENSITY
     """Least and greatest intensity, 0...1."""
     probability: float = PROBABILITY
-    """Share of pictures that are blurred."""
+    """Share of images that are blurred."""
 
     def __post_init__(self) -> None:
         if not 3 <= self.k[0] < self.k[1]:
@@ -71,7 +71,7 @@ class DrawnBlur:
 
 
 def drawn_blur(ranges: KernelRange, draw: np.random.Generator) -> DrawnBlur | None:
-    """A kernel for one picture, or None for a picture that stays sharp."""
+    """A kernel for one image, or None for a image that stays sharp."""
     chance = draw.uniform()
     k, phi = int(draw.integers(*ranges.k)), float(draw.uniform(*ranges.phi))
     if chance >= ranges.probability:
@@ -97,20 +97,20 @@ def motion_kernel(k: int, phi: float, draw: np.random.Generator) -> Float32[np.n
 
 
 def blurred(
-    picture: UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"],
+    image: UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"],
     kernel: Float32[np.ndarray, "k k"],
 ) -> UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"]:
-    """A picture of the same size, its stored values convolved with a kernel.
+    """A image of the same size, its stored values convolved with a kernel.
 
     What lies beyond the border is the border's own colour; published data darken there.
     """
     turned = cv2.flip(kernel, -1)  # OpenCV correlates
     anchor = (len(kernel) // 2,) * 2
     mixed = cv2.filter2D(
-        picture.astype(np.float32), -1, turned, anchor=anchor, borderType=cv2.BORDER_REPLICATE
+        image.astype(np.float32), -1, turned, anchor=anchor, borderType=cv2.BORDER_REPLICATE
     )
-    white = np.iinfo(picture.dtype).max
-    return np.rint(mixed.clip(0, white)).astype(picture.dtype).reshape(picture.shape)
+    white = np.iinfo(image.dtype).max
+    return np.rint(mixed.clip(0, white)).astype(image.dtype).reshape(image.shape)
 
 
 def _steps(phi: float, diagonal: float, draw: np.random.Generator) -> Float64[np.ndarray, "s"]:

@@ -1,4 +1,4 @@
-"""Films of held-out event cameras, and their part of the report."""
+"""Videos of held-out event cameras, and their part of the report."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +7,7 @@ import av
 import numpy as np
 
 from sharpfield.evaluation.evaluate import evaluate
-from sharpfield.evaluation.event_films import GAP_PX, WINDOWS, event_films, events_section
+from sharpfield.evaluation.event_videos import GAP_PX, WINDOWS, event_videos, events_section
 from sharpfield.evaluation.report import Story, write_report
 from tests.evaluation.test_event_scores import Scene
 from tests.evaluation.test_report import checked
@@ -19,12 +19,12 @@ def frames_of(path: Path) -> np.ndarray:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
 
 
-def test_a_film_shows_what_was_recorded_beside_what_is_predicted(tmp_path: Path):
+def test_a_video_shows_what_was_recorded_beside_what_is_predicted(tmp_path: Path):
     moving = tiny_moving()
-    (told,) = event_films(Scene(moving, 1.0), moving, tmp_path)
-    film = frames_of(tmp_path / told["film"])
-    assert film.shape == (WINDOWS, 240, 2 * 240 + GAP_PX, 3)
-    recorded, predicted = (part.astype(int) for part in (film[:, :, :240], film[:, :, -240:]))
+    (told,) = event_videos(Scene(moving, 1.0), moving, tmp_path)
+    video = frames_of(tmp_path / told["video"])
+    assert video.shape == (WINDOWS, 240, 2 * 240 + GAP_PX, 3)
+    recorded, predicted = (part.astype(int) for part in (video[:, :, :240], video[:, :, -240:]))
     assert brighter(recorded).any() and brighter(-recorded).any()
     # of the true scene: what is predicted happened; remainders at both ends are left out
     assert brighter(recorded)[brighter(predicted)].mean() > 0.7
@@ -39,22 +39,22 @@ def brighter(part: np.ndarray) -> np.ndarray:
 
 def frames_of_nothing(folder: Path) -> np.ndarray:
     moving = tiny_moving()
-    (told,) = event_films(Scene(moving, 0.0), moving, folder / "nothing")
-    return frames_of(folder / "nothing" / told["film"])[:, :, -240:].astype(int)
+    (told,) = event_videos(Scene(moving, 0.0), moving, folder / "nothing")
+    return frames_of(folder / "nothing" / told["video"])[:, :, -240:].astype(int)
 
 
 def test_the_report_plays_it(tmp_path: Path):
     moving = tiny_moving()
     metrics = evaluate(Scene(moving, 1.0), moving, tmp_path)
-    assert [one["film"] for one in metrics["events"]["films"]] == ["renders/events/03.mp4"]
+    assert [one["video"] for one in metrics["events"]["videos"]] == ["renders/events/03.mp4"]
     told = checked(write_report(tmp_path, moving, metrics, Story("a moving scene")))
     assert sum(one.startswith("data:video/mp4;base64,") for one in told.references) == 1
     for text in ("Held-out event cameras", "Camera 3", "event PSNR (dB)", "1/32 of the capture"):
         assert text in told.text, text
 
 
-def test_without_held_out_events_there_is_no_film(tmp_path: Path):
+def test_without_held_out_events_there_is_no_video(tmp_path: Path):
     still = replace(tiny_moving(), test_events=None)
-    assert event_films(Scene(still, 1.0), still, tmp_path) == []
+    assert event_videos(Scene(still, 1.0), still, tmp_path) == []
     assert events_section(tmp_path, {"mean": {}}) == ""
     assert not list(tmp_path.iterdir())

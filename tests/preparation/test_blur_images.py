@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.preparation.quality import blur_pictures
+from sharpfield.preparation.quality import blur_images
 from sharpfield.simulation.sensors.motion_kernel import KernelRange
 from sharpfield.storage.images import read_image, write_image
 
@@ -19,28 +19,28 @@ def folder(tmp_path):
 
 def test_names_and_sizes_stay_and_sharp_ones_are_copied(folder, tmp_path):
     half = KernelRange(probability=0.5)
-    rows = blur_pictures(folder, tmp_path / "out", ranges=half, seed=2)
+    rows = blur_images(folder, tmp_path / "out", ranges=half, seed=2)
     told = json.loads((tmp_path / "out" / "blur.json").read_text())
-    assert told["pictures"] == rows and told["k"] == [3, 16] and told["probability"] == 0.5
+    assert told["images"] == rows and told["k"] == [3, 16] and told["probability"] == 0.5
     assert 0 < sum(row["blurred"] for row in rows) < 6
     for row in rows:
         before, after = (read_image(place / row["name"]) for place in (folder, tmp_path / "out"))
         assert before.shape == after.shape
         assert np.array_equal(before, after) is not row["blurred"]
         assert not row["blurred"] or 3 <= row["k"] < 16
-    assert blur_pictures(folder, tmp_path / "out", ranges=half, seed=2) == rows
+    assert blur_images(folder, tmp_path / "out", ranges=half, seed=2) == rows
 
 
-def test_nothing_is_left_when_a_picture_cannot_be_read(folder, tmp_path):
-    (folder / "p9.png").write_bytes(b"not a picture")
+def test_nothing_is_left_when_a_image_cannot_be_read(folder, tmp_path):
+    (folder / "p9.png").write_bytes(b"not a image")
     with pytest.raises(CaptureError, match="cannot decode image"):
-        blur_pictures(folder, tmp_path / "out", ranges=KernelRange(probability=1.0))
+        blur_images(folder, tmp_path / "out", ranges=KernelRange(probability=1.0))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["in"]
 
 
 def test_other_folders_are_not_replaced(folder, tmp_path):
     with pytest.raises(CaptureError, match="will not replace what is not a folder of blurred"):
-        blur_pictures(folder, folder)
+        blur_images(folder, folder)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(CaptureError, match="there are no pictures"):
-        blur_pictures(tmp_path / "empty", tmp_path / "out")
+    with pytest.raises(CaptureError, match="there are no images"):
+        blur_images(tmp_path / "empty", tmp_path / "out")

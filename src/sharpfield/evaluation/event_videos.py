@@ -1,6 +1,6 @@
-"""Films of event frames: what a held-out event camera recorded, and what a model predicts for it.
+"""Videos of event frames: what a held-out event camera recorded, and what a model predicts for it.
 
-A film shows windows one after the other, recorded on the left, predicted on the right, in one
+A video shows windows one after the other, recorded on the left, predicted on the right, in one
 scale. The prediction is the published one, the change of log light between the ends of a window in
 whole thresholds; the `events` command renders streams.
 
@@ -21,17 +21,17 @@ from sharpfield.report import page
 from sharpfield.report.colormaps import colour_signs
 from sharpfield.report.event_frames import busy
 from sharpfield.report.tables import Table, as_html
-from sharpfield.report.video import write_film
+from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
 
 CAMERAS = 2
-"""Most cameras that are filmed, evenly spread over those held out."""
+"""Most cameras recorded as videos, evenly spread over those held out."""
 WINDOWS = 20
-"""Of a film; together they last as long as the capture."""
+"""Of a video; together they last as long as the capture."""
 RATE = 8.0
 """Windows per second."""
 HIGH_PX = 240
-"""Smaller pictures are enlarged by a whole number of times up to this height."""
+"""Smaller images are enlarged by a whole number of times up to this height."""
 GAP_PX = 4
 """Between the two."""
 
@@ -48,8 +48,8 @@ COLUMNS = {
 Colours = UInt8[np.ndarray, "height width 3"]
 
 
-def event_films(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
-    """Write a film for some held-out event cameras.
+def event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
+    """Write a video for some held-out event cameras.
 
     Args:
         model: Trained.
@@ -57,7 +57,7 @@ def event_films(model: Model, capture: Capture, run: Path) -> list[dict[str, Any
         run: Folder that gets `renders/events/`.
 
     Returns:
-        The number of each camera, and where its film is.
+        The number of each camera, and where its video is.
     """
     held_out = capture.test_events
     if held_out is None or not len(held_out):
@@ -68,8 +68,8 @@ def event_films(model: Model, capture: Capture, run: Path) -> list[dict[str, Any
     for track in chosen.astype(int).tolist():
         path = Path("renders") / "events" / f"{track:02d}.mp4"
         (run / path).parent.mkdir(parents=True, exist_ok=True)
-        write_film(run / path, _pictures(model, capture, track), rate=RATE)
-        found.append({"track": track, "film": path.as_posix()})
+        write_video(run / path, _images(model, capture, track), rate=RATE)
+        found.append({"track": track, "video": path.as_posix()})
     return found
 
 
@@ -82,14 +82,14 @@ def events_section(run: Path, metrics: Mapping[str, Any]) -> str:
         (f"1/{1 / float(length):.0f} of the capture", *(f"{scores[n]:.4g}" for n in COLUMNS))
         for length, scores in events["lengths"].items()
     )
-    films = [
-        page.film((run / one["film"]).read_bytes(), f"Camera {one['track']}")
-        for one in events.get("films", [])
-        if (run / one["film"]).is_file()
+    videos = [
+        page.video((run / one["video"]).read_bytes(), f"Camera {one['track']}")
+        for one in events.get("videos", [])
+        if (run / one["video"]).is_file()
     ]
     return page.section(
         "Held-out event cameras",
-        "".join(films),
+        "".join(videos),
         as_html(Table(("windows", *COLUMNS.values()), rows)),
         page.folded("What the numbers are", page.definitions(events["definitions"])),
         intro="Event frames, recorded on the left and predicted on the right: red brighter, blue"
@@ -97,7 +97,7 @@ def events_section(run: Path, metrics: Mapping[str, Any]) -> str:
     )
 
 
-def _pictures(model: Model, capture: Capture, track: int) -> list[Colours]:
+def _images(model: Model, capture: Capture, track: int) -> list[Colours]:
     """Both frames of each window."""
     assert capture.test_events is not None
     index = event_index(capture.test_events)

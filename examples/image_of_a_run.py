@@ -1,6 +1,6 @@
-"""One picture of an evaluated run: a blurry frame, its events, the rebuilt scene, the truth.
+"""One image of an evaluated run: a blurry frame, its events, the rebuilt scene, the truth.
 
-python examples/picture_of_a_run.py runs/demo --out docs/pictures/demo.png
+python examples/image_of_a_run.py runs/demo --out docs/images/demo.png
 """
 
 import argparse
@@ -11,19 +11,19 @@ import numpy as np
 
 from sharpfield.captures.read import read
 from sharpfield.core.events import EventStream
-from sharpfield.runs.config import read_started
+from sharpfield.runs.config import read_run_config
 from sharpfield.storage.images import read_image, write_image
 
 SCALE, GAP = 2, 6
 RED, BLUE = (200, 40, 40), (40, 60, 200)
 
 
-def event_picture(events: EventStream) -> np.ndarray:
+def event_image(events: EventStream) -> np.ndarray:
     """Red where it last got brighter, blue where darker, white where nothing happened."""
-    picture = np.full((events.height, events.width, 3), 255, np.uint8)
+    image = np.full((events.height, events.width, 3), 255, np.uint8)
     x, y = np.rint(events.x).astype(int), np.rint(events.y).astype(int)
-    picture[y, x] = np.where((events.p > 0)[:, None], RED, BLUE)
-    return picture
+    image[y, x] = np.where((events.p > 0)[:, None], RED, BLUE)
+    return image
 
 
 def main() -> None:
@@ -34,13 +34,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
 
-    capture = read(read_started(options.run).capture)
+    capture = read(read_run_config(options.run).capture)
     frames, events = capture.needed_frames, capture.needed_events
     opens, closes = frames.exposure.window(options.frame)
     rebuilt = options.run / "renders" / "train" / f"{frames.names[options.frame]}.png"
     panels = [
         frames.images[options.frame],
-        event_picture(events.window(opens, opens + (closes - opens) // 4)),
+        event_image(events.window(opens, opens + (closes - opens) // 4)),
         read_image(rebuilt),
     ]
     if frames.truth is not None:
