@@ -1,0 +1,78 @@
+"""Plug-in points: what other packages add by entry points, loaded when it is first asked for.
+
+A package names its objects in its own `pyproject.toml`, one line each:
+
+    [project.entry-points."sharpfield.recipes"]
+    my-paper = "my_package.my_paper:MyPaper"
+
+The groups are `sharpfield.recipes`, `sharpfield.layouts`, `sharpfield.formats`,
+`sharpfield.metrics` and `sharpfield.lenses`. An entry point that cannot be loaded is named in one
+warning and left out; everything else goes on working.
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+
+class PluginWarning(UserWarning):
+    """An installed package offers something that cannot be used."""
+
+
+class Registry(Mapping[str, Any]):
+    """Objects by name: our own, and those of installed packages, which are loaded when asked for.
+
+    Args:
+        group: Name of the entry points, such as `sharpfield.recipes`.
+        own: Our own objects, or `module:name` references to import when one is asked for. They win
+            over entry points of the same name.
+    """
+
+    def __init__(self, group: str, own: Mapping[str, Any]) -> None:
+        self.group, self.own = group, dict(own)
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self.own:
+            found = self.own[name]
+            if isinstance(found, str):
+                found = EntryPoint(name, found, self.group).load()
+                self.own[name] = found
+            return found
+        found = _loaded(_installed(self.group)[name])
+        if found is None:
+            raise KeyError(name)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of our own objects, then of those of other packages, none of which is loaded."""
+        yield from self.own
+        yield from (name for name in _installed(self.group) if name not in self.own)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def working(self) -> dict[str, Any]:
+        """All objects that can be loaded."""
+        found = {name: self.get(name) for name in self}
+        return {name: one for name, one in found.items() if one is not None}
+
+
+def _installed(group: str) -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+@cache
+def _loaded(entry: EntryPoint) -> Any | None:
+    """The object of an entry point, or None with a warning. Whatever a stranger raises is told."""
+    try:
+        return entry.load()
+    except Exception as error:  # noqa: BLE001 - a package of others may fail in any way
+        warnings.warn(
+            f"the entry point {entry.name} = {entry.value} of {entry.group} cannot be loaded and"
+            f" is left out ({type(error).__name__}: {error})",
+            PluginWarning,
+            stacklevel=2,
+        )
+        return None
