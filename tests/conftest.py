@@ -77,7 +77,7 @@ def panning() -> Capture:
         ),
         events=random_events(5_000),
         split=Split(np.arange(1, 8), np.array([0, 8])),
-        name="tiny",
+        name="panning",
     )
 
 
