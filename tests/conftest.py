@@ -18,6 +18,11 @@ from tests.streams import HEIGHT, WIDTH, random_events
 SAMPLES = Path(__file__).parents[1].parent / "shared" / "data"
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of our own."""
+    parser.addoption("--golden", action="store_true", help="compute all golden numbers")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> None:
     """The tensors of tests are tiny: more threads would only wait for each other."""
