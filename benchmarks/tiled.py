@@ -20,7 +20,7 @@ from sharpfield.recordings.prophesee.evt import open_evt
 from sharpfield.recordings.prophesee.header import read_header
 from sharpfield.recordings.recording import Recording
 from sharpfield.recordings.ros.event_messages import EVENT, PADDED_EVENT
-from sharpfield.recordings.ros.ros1_writer import write_ros1_bag
+from tests.recordings.ros.ros1_writer import write_ros1_bag
 
 HEADER = "% {name}\n% format {name};height={height};width={width}\n% Version 2\n"
 HEADER += "% Width {width}\n% Height {height}\n% end\n"

@@ -25,14 +25,14 @@ from sharpfield.cli.main import main as sharpfield
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.se3 import quaternion_from_rotation
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.recordings.aedat.aedat4_writer import write_aedat4
 from sharpfield.recordings.recording import Frame, Recording
-from sharpfield.recordings.ros.ros1_writer import write_ros1_bag
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.evt_writer import writing_evt
 from sharpfield.storage.images import write_image
+from tests.recordings.aedat.aedat4_writer import write_aedat4
+from tests.recordings.ros.ros1_writer import write_ros1_bag
 
 EXPOSURE_US, INTERVAL_US = 30_000, 40_000
 Words = tuple[object, ...]

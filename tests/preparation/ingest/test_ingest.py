@@ -18,15 +18,15 @@ from sharpfield.preparation.ingest.ingest import Ingested, ingest
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
 from sharpfield.preparation.ingest.stage import Stage
-from sharpfield.recordings.aedat.aedat4_writer import write_aedat4
 from sharpfield.recordings.open import ReaderOptions, open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers
-from sharpfield.recordings.ros.ros1_writer import write_ros1_bag
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, simulate
 from sharpfield.simulation.simulate import Timing as Exposures
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
+from tests.recordings.aedat.aedat4_writer import write_aedat4
+from tests.recordings.ros.ros1_writer import write_ros1_bag
 
 SIZE = (32, 24)
 SAME = IngestOptions(timing=Timing(clock="same"), scene=Scene(encoding="gamma2.2"))

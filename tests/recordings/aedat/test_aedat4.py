@@ -10,10 +10,10 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat4 import open_aedat4
-from sharpfield.recordings.aedat.aedat4_writer import write_aedat4
-from sharpfield.recordings.aedat.flatbuffers import Scalar, Vector, packed
 from sharpfield.recordings.recording import Frame, Recording
 from tests.recordings import fuzz
+from tests.recordings.aedat.aedat4_writer import write_aedat4
+from tests.recordings.aedat.flatbuffer_writer import Scalar, Vector, packed
 from tests.recordings.captured import (
     START_US,
     expect_equal_events,

@@ -2,8 +2,9 @@ import struct
 
 import pytest
 
-from sharpfield.recordings.aedat.flatbuffers import Scalar, Tables, Vector, packed, root
+from sharpfield.recordings.aedat.flatbuffers import root
 from sharpfield.recordings.bytes import Damaged
+from tests.recordings.aedat.flatbuffer_writer import Scalar, Tables, Vector, packed
 
 # By hand: size, root at 20, name; index of 8 bytes (two fields, at 4 and 8 of a table of 12 bytes);
 # table: way to its index, a number, the way to a vector; the vector: two entries of 16 bits.

@@ -11,7 +11,6 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.recordings.ros.recording import open_rosbag
-from sharpfield.recordings.ros.ros1_writer import write_ros1_bag
 from tests.recordings import fuzz
 from tests.recordings.bags import ARRAY, COMPRESSED, IMAGE, PACKET, Ros, parts
 from tests.recordings.captured import (
@@ -22,6 +21,7 @@ from tests.recordings.captured import (
     some_recording,
 )
 from tests.recordings.prophesee.test_evt import random_evt3
+from tests.recordings.ros.ros1_writer import write_ros1_bag
 from tests.streams import HEIGHT, WIDTH, random_events
 
 CONTAINERS = ["ros1", "sqlite3", "mcap"]

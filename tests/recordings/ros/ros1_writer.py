@@ -10,12 +10,13 @@ Source: the message definitions of dvs_msgs (rpg_dvs_ros) and of common_msgs.
 import struct
 from collections.abc import Callable, Iterator
 from heapq import merge
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sharpfield.core.errors import CaptureError, need
+from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
 from sharpfield.recordings.recording import Frame, Recording
@@ -60,11 +61,9 @@ def write_ros1_bag(path: Path, recording: Recording, *, name: str = "/dvs") -> N
     Raises:
         CaptureError: Events are unsound, an image is neither grey nor RGB, or a time lies outside
             1970 to 2106.
-        MissingExtra: The package `rosbags` is not installed.
     """
-    purpose = "writing bags of ROS"
-    bags: Any = need("rosbags.rosbag1", extra="io", purpose=purpose)
-    types = _types(need("rosbags.typesys", extra="io", purpose=purpose))
+    bags: Any = import_module("rosbags.rosbag1")
+    types = _types(import_module("rosbags.typesys"))
     with replacing(path) as temporary:
         temporary.unlink()  # the writer wants to make it
         with bags.Writer(temporary) as writer:

@@ -9,17 +9,18 @@ import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from heapq import merge
+from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, NamedTuple
 
 import numpy as np
 
-from sharpfield.core.errors import CaptureError, need
+from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
 from sharpfield.recordings.aedat.aedat4 import EDGES, EVENT, FIRST_LINE, PIXELS
-from sharpfield.recordings.aedat.flatbuffers import Scalar, Tables, Vector, packed
 from sharpfield.recordings.recording import Frame, Recording, Triggers
+from tests.recordings.aedat.flatbuffer_writer import Scalar, Tables, Vector, packed
 
 PACKET = 2**14
 """Most events in a packet, as DV has it about."""
@@ -45,7 +46,6 @@ def write_aedat4(path: Path, recording: Recording, *, packing: Packing = "lz4") 
 
     Raises:
         CaptureError: Events are unsound, or an image is neither grey nor RGB.
-        MissingExtra: The package that compresses is not installed.
     """
     pack = _PACKERS[packing]()
     with replacing(path) as temporary, temporary.open("wb") as file:
@@ -160,12 +160,12 @@ def _none() -> Callable[[bytes], bytes]:
 
 
 def _lz4() -> Callable[[bytes], bytes]:
-    frame: Any = need("lz4.frame", extra="io", purpose="writing AEDAT4 packed with LZ4")
+    frame: Any = import_module("lz4.frame")
     return frame.compress
 
 
 def _zstd() -> Callable[[bytes], bytes]:
-    zstd: Any = need("zstandard", extra="io", purpose="writing AEDAT4 packed with Zstandard")
+    zstd: Any = import_module("zstandard")
     return zstd.ZstdCompressor(level=1).compress
 
 
