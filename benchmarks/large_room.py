@@ -43,11 +43,11 @@ STAGES = {
     "read": ("sharpfield.cli.runs", "read"),
     "judge": ("sharpfield.metrics.quality", "quality"),
     "fuse": ("sharpfield.initialisation.point_cloud", "fuse_points"),
-    "fit": ("sharpfield.training.train", "fit"),
-    "step": ("sharpfield.training.fit", "accumulate"),
+    "fit": ("sharpfield.training.session", "fit"),
+    "step": ("sharpfield.training.loop", "accumulate"),
     "grow": ("sharpfield.recipes.points.model", "missing_points"),
     "save": ("sharpfield.training.record", "save_last"),
-    "load": ("sharpfield.training.train", "recover"),
+    "load": ("sharpfield.training.session", "recover"),
 }
 """Functions whose times are taken, and where they are looked up."""
 

@@ -20,7 +20,7 @@ from sharpfield.rendering.view import render_view
 from sharpfield.report.colormaps import eight_bit
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 
 

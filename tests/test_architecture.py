@@ -103,7 +103,7 @@ def test_postponed_annotations_are_absent():
         ("core/camera.py", "from sharpfield.geometry import cast"),
         ("fields/mlp.py", "import sharpfield.rendering.volume"),
         ("losses/edi.py", "def late():\n    from sharpfield import captures"),
-        ("training/fit.py", "from sharpfield.recipes import RECIPES"),
+        ("training/loop.py", "from sharpfield.recipes import RECIPES"),
     ],
 )
 def test_a_planted_climb_is_found(tmp_path: Path, file: str, line: str):

@@ -149,7 +149,7 @@ def test_an_interrupted_training_says_so_to_what_would_follow(
     def interrupted(*_: object, **__: object) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
-    monkeypatch.setattr(import_module("sharpfield.training.train"), "fit", interrupted)
+    monkeypatch.setattr(import_module("sharpfield.training.session"), "fit", interrupted)
     words = ("--preset", "draft", "--steps", 4, *SMALL)
     assert run("train", "ev-deblur-nerf", recorded, "--out", tmp_path / "run", *words) == 130
 

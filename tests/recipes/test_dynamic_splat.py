@@ -21,10 +21,10 @@ from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOpti
 from sharpfield.rendering.view import ViewRenderer, render_view
 from sharpfield.storage.event_cache import event_index
 from sharpfield.training.checkpoint import file_of
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
 

@@ -14,7 +14,7 @@ from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.presets import SIZES, VARIANTS, prepared
 from sharpfield.recipes.volume.scene import VolumeOptions
 from sharpfield.rendering.view import render_view
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 
 SMALL = VolumeOptions(

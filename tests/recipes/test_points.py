@@ -23,10 +23,10 @@ from sharpfield.recipes.points.model import DrawOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions
 from sharpfield.rendering.view import render_view
 from sharpfield.training.checkpoint import file_of
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 from tests.recipes.box import box
 from tests.training.toy import quiet
 

@@ -28,10 +28,10 @@ from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.checkpoint import file_of
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
 

@@ -19,7 +19,7 @@ from sharpfield.training.checkpoint import (
     save_best,
     save_last,
 )
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from sharpfield.core.schedule import Group, linear
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam, set_rates
 from tests.training.toy import Toy
 

@@ -3,7 +3,7 @@ import signal
 
 import pytest
 
-from sharpfield.training.train import Stop
+from sharpfield.training.session import Stop
 
 
 def test_nothing_asks_to_stop_by_itself():

@@ -15,11 +15,11 @@ from sharpfield.training.checkpoint import (
     restore_weights,
     save_last,
 )
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
 from sharpfield.training.surgery import rebuild, resize
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 from tests.training.growing import Blobs, GrowingToy
 from tests.training.toy import Toy, quiet
 

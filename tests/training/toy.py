@@ -18,7 +18,7 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
 from sharpfield.training.plan import Options
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 
 
 class Toy(nn.Module):

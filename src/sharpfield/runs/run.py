@@ -21,7 +21,7 @@ from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.plan import Options
 from sharpfield.training.record import Ledger, read_ledger
-from sharpfield.training.train import require_unused, train
+from sharpfield.training.session import require_unused, train
 
 STREAMS = ("frames", "events")
 

@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 from sharpfield.core.errors import RunError
 from sharpfield.core.measurements import Batch
 from sharpfield.core.protocols import Model
-from sharpfield.training.fit import Hook
+from sharpfield.training.loop import Hook
 from sharpfield.training.memory import Losses
 
 

@@ -8,7 +8,7 @@ import torch
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.memory import GIB, SHARE, available_bytes, plan_parts
 from sharpfield.training.optim import adam, device_of
 

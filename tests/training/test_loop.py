@@ -2,7 +2,7 @@ import itertools
 
 import torch
 
-from sharpfield.training.fit import fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 

@@ -16,7 +16,7 @@ from sharpfield.core.errors import RunError
 from sharpfield.training.checkpoint import file_of, load
 from sharpfield.training.plan import Options
 from sharpfield.training.record import Ledger, read_ledger
-from sharpfield.training.train import train
+from sharpfield.training.session import train
 from tests.training import toy
 from tests.training.toy import Toy, quiet, score
 

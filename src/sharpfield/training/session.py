@@ -18,7 +18,7 @@ from rich.console import Console
 from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
 from sharpfield.training.checkpoint import Checkpoint, Progress, check_settings, recover, restore
-from sharpfield.training.fit import Hook, fit
+from sharpfield.training.loop import Hook, fit
 from sharpfield.training.hooks import every, every_seconds, finite
 from sharpfield.training.log import Log, LogLosses
 from sharpfield.training.optim import adam, device_of
