@@ -23,8 +23,8 @@ from sharpfield.losses.photometric import mse
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.presets import nerf_draft
 from sharpfield.simulation.simulate import Rig, Timing, simulate
-from sharpfield.training.loop import fit
 from sharpfield.training.hooks import every
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 
 

@@ -2,8 +2,8 @@ import pytest
 import torch
 
 from sharpfield.core.errors import RunError
-from sharpfield.training.loop import fit
 from sharpfield.training.hooks import describe, every, every_seconds, finite
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 

@@ -18,8 +18,8 @@ from sharpfield.training.checkpoint import (
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options
-from sharpfield.training.surgery import rebuild, resize
 from sharpfield.training.session import train
+from sharpfield.training.surgery import rebuild, resize
 from tests.training.growing import Blobs, GrowingToy
 from tests.training.toy import Toy, quiet
 

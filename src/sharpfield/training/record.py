@@ -13,8 +13,8 @@ from sharpfield.core.errors import RunError
 from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
 from sharpfield.training.checkpoint import Progress, save_best, save_last
-from sharpfield.training.loop import Hook
 from sharpfield.training.log import Log
+from sharpfield.training.loop import Hook
 from sharpfield.training.memory import Losses, peak_memory_mb
 from sharpfield.training.optim import device_of
 
