@@ -6,8 +6,8 @@ import torch
 
 from sharpfield.core.protocols import Response
 from sharpfield.core.seed import generator
-from sharpfield.core.tone import gamma
-from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual, luma, passed
+from sharpfield.core.tone import gamma, luma
+from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual, passed
 from tests.formation.toy import pairs
 
 LEARNED = LearnedResponse()
@@ -44,7 +44,7 @@ def test_all_can_take_each_others_place(response):
 
 
 def test_luma_of_grey_is_grey():
-    torch.testing.assert_close(luma(grey(0)[0])[:, 0, 0], EVEN)
+    torch.testing.assert_close(luma(grey(0)[0])[:, 0], EVEN)
 
 
 def test_a_filter_passes_its_own_colour():

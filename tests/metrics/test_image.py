@@ -68,7 +68,7 @@ def test_the_definitions_differ():
 @pytest.mark.parametrize("pair", [waves, noisy, lambda: noisy(1)])
 def test_scikit_image_agrees(pair):
     metrics = pytest.importorskip("skimage.metrics")
-    a, b = (one.double().numpy() for image in pair())
+    a, b = (one.double().numpy() for one in pair())
     gaussian = metrics.structural_similarity(
         b,
         a,

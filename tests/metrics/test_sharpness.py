@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.metrics.image import gradient_energy, laplacian_variance, luma
+from sharpfield.core.tone import luma
+from sharpfield.metrics.image import gradient_energy, laplacian_variance
 
 
 def noise(channels: int = 3) -> torch.Tensor:

@@ -23,6 +23,21 @@ def identity(light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
     return light
 
 
+REC601 = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in luma."""
+
+
+def luma(image: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+    """Rec. 601 luma of three channels; a single channel as it is.
+
+    Of display values it is their brightness; of linear light, what a pixel without a colour filter
+    measures.
+    """
+    if image.shape[-1] == 1:
+        return image[..., 0]
+    return (image * image.new_tensor(REC601)).sum(-1)  # ITU-R BT.601
+
+
 GAMMA = 2.2
 
 GAMMA_TOE = 1e-5

@@ -12,7 +12,8 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
-from sharpfield.metrics.image import luma, psnr
+from sharpfield.core.tone import luma
+from sharpfield.metrics.image import psnr
 
 DARK = 0.1
 """Added to display values before the logarithm (published)."""

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.metrics.image import luma
+from sharpfield.core.tone import luma
 
 DARK = 1e-3
 """Values below this count as this: the logarithm of nearly nothing would rule the fit."""

@@ -19,9 +19,10 @@ from torch import Tensor
 from sharpfield.core.capture import USUAL_THRESHOLD, Capture
 from sharpfield.core.device import device_of
 from sharpfield.core.protocols import Model
+from sharpfield.core.tone import luma
 from sharpfield.events.image import window_image
 from sharpfield.events.index import EventIndex
-from sharpfield.metrics.image import luma, ssim
+from sharpfield.metrics.image import ssim
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.storage.event_cache import event_index
 

@@ -20,7 +20,6 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.seed import evenly_spread
 from sharpfield.evaluation.event_videos import events_section
 from sharpfield.evaluation.views import SHARP, TRUTH, Reference, held_out, trained_on
-from sharpfield.metrics.image import luma
 from sharpfield.report import page
 from sharpfield.report.capture import captured
 from sharpfield.report.colormaps import ERROR_WHITE, colour_error, eight_bit

@@ -31,7 +31,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.measurements import EventPairs
-from sharpfield.core.tone import Curve, identity
+from sharpfield.core.tone import Curve, identity, luma
 from sharpfield.ops.dense import Dense, linear
 
 BATCH = 64 * 3
@@ -89,8 +89,6 @@ def _slope(layers: Layers, x: Float[np.ndarray, "b 1"], step: float) -> Float[np
     return np.concatenate(slopes[::-1])
 
 
-LUMA = (0.299, 0.587, 0.114)
-
 FLOOR = 1e-5
 
 START_SEED = 12
@@ -112,13 +110,6 @@ def passed(light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b 
     return light.gather(-1, channel)
 
 
-def luma(light: Float[Tensor, "*b d"]) -> Float[Tensor, "*b 1"]:
-    """What a mono pixel sees of three colours; a single colour is returned as it is."""
-    if light.shape[-1] == 1:
-        return light
-    return (light * light.new_tensor(LUMA)).sum(-1, keepdim=True)
-
-
 @dataclass(frozen=True)
 class FixedResponse:
     """A known curve on each colour, then luma, then the logarithm."""
@@ -129,7 +120,7 @@ class FixedResponse:
 
     def __call__(self, light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b k 1"]:
         """log(luma(curve(light)) + floor)."""
-        return (luma(self.curve(passed(light, seen))) + self.floor).log()
+        return (luma(self.curve(passed(light, seen)))[..., None] + self.floor).log()
 
 
 class LearnedResponse(nn.Module):
@@ -174,7 +165,7 @@ class LearnedResponse(nn.Module):
 
     def forward(self, light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b k 1"]:
         """log(luma(phi(light)) + floor)."""
-        return (luma(self.curve(passed(light, seen), seen)) + self.floor).log()
+        return (luma(self.curve(passed(light, seen), seen))[..., None] + self.floor).log()
 
     def curve(self, light: Float[Tensor, "b k d"], seen: EventPairs) -> Float[Tensor, "b k d"]:
         """The curve phi itself, 0...1."""
@@ -215,7 +206,7 @@ class LogResidual(nn.Module):
 
     def forward(self, light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b k 1"]:
         """log(x + floor) + h(log(x + floor), polarity), x the light that reaches the pixel."""
-        log = (luma(passed(light, seen)) + self.floor).log()
+        log = (luma(passed(light, seen))[..., None] + self.floor).log()
         read = _read(1 + self.stretch * log, seen, self.features)  # [b, k, 1, features]
         return log + self.steps(read).tanh() @ self._bounded_heights()
 

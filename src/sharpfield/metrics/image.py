@@ -24,6 +24,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.errors import ShapeError
+from sharpfield.core.tone import luma
 
 Image = Float[Tensor, "h w c"]
 
@@ -108,16 +109,6 @@ def _same_shape(predicted: Image, truth: Image) -> None:
             "images to compare have different shapes",
             got=f"{tuple(predicted.shape)} and {tuple(truth.shape)}",
         )
-
-
-REC601 = (0.299, 0.587, 0.114)
-
-
-def luma(image: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
-    """Brightness of display values: Rec. 601 for three channels, the channel itself for one."""
-    if image.shape[-1] == 1:
-        return image[..., 0]
-    return image @ image.new_tensor(REC601)
 
 
 def laplacian_variance(image: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:

@@ -89,9 +89,9 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(
-        self, predicted: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]
+        self, predicted: Float[Tensor, "h w c"], truth: Float[Tensor, "h w c"]
     ) -> Float[Tensor, ""]:
-        """Distance of two images in 0...1, display domain.
+        """Distance of two images in 0...1, display domain; grey ones are repeated three times.
 
         Raises:
             ShapeError: The images are too small for the network.
@@ -103,6 +103,7 @@ class Lpips:
                 got=f"{truth.shape[1]}x{truth.shape[0]}",
                 do="leave LPIPS out for such small images",
             )
+        predicted, truth = predicted.expand(-1, -1, 3), truth.expand(-1, -1, 3)
         total = predicted.new_zeros(())
         pairs = zip(self._unit_features(predicted), self._unit_features(truth), strict=True)
         for weight, (x, y) in zip(self.linear, pairs, strict=True):

@@ -19,12 +19,12 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.files import write_json
 from sharpfield.core.seed import evenly_spread
-from sharpfield.core.tone import tone_of
+from sharpfield.core.tone import luma, tone_of
 from sharpfield.events.edi import FLOOR, joint_latents, latent, published
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import edge_density
-from sharpfield.metrics.image import gradient_energy, luma, psnr
+from sharpfield.metrics.image import gradient_energy, psnr
 from sharpfield.preparation.thresholds import Found, find_thresholds, known_thresholds, linear_light
 from sharpfield.storage.images import write_image
 

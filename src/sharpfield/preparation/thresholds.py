@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
-from sharpfield.core.tone import Tone, tone_of
+from sharpfield.core.tone import Tone, luma, tone_of
 from sharpfield.events.edi import latent
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
@@ -21,7 +21,6 @@ from sharpfield.events.threshold_search import (
     distance_from_usual,
     edge_density,
 )
-from sharpfield.metrics.image import luma
 
 PAIRS = 4
 """Pairs of neighbouring frames looked at, spread over the capture."""

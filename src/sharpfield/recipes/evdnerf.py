@@ -17,9 +17,10 @@ from sharpfield.core.measurements import Batch, EventPairs
 from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
+from sharpfield.core.tone import luma
 from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
-from sharpfield.formation.response import FixedResponse, luma
+from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
@@ -198,7 +199,7 @@ class Model(nn.Module):
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
         """As the event camera sees it, after the last stage: what is learned is compressed."""
-        log = (luma(light)[..., 0] + FLOOR).log()
+        log = (luma(light) + FLOOR).log()
         if self.recipe.dead_zone or not self.recipe.gamma:
             return log
         return log * (self.most(self.recipe.steps) / self.recipe.gamma)

@@ -20,10 +20,10 @@ from sharpfield.core.measurements import Batch, EventPairs, Pixels
 from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
-from sharpfield.core.tone import tone_of
+from sharpfield.core.tone import luma, tone_of
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds, thresholds_of
 from sharpfield.formation.events import LogContrast
-from sharpfield.formation.response import FixedResponse, luma
+from sharpfield.formation.response import FixedResponse
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
@@ -194,7 +194,7 @@ class Model(nn.Module):
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
         """As the event camera sees it."""
-        return (luma(light)[..., 0] + self.floor).log()
+        return (luma(light) + self.floor).log()
 
     def groups(self) -> list[Group]:
         """Voxels, thresholds and clocks."""

@@ -83,11 +83,6 @@ def module_of(model: Model) -> nn.Module:
     return model
 
 
-def device_of(model: Model) -> torch.device:
-    """Where a model's parameters are."""
-    return next(module_of(model).parameters()).device
-
-
 def adam(model: Model) -> RowAdam:
     """Adam over the model's groups, with the rates of step 0.
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import torch
 
+from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
 from sharpfield.training.loop import fit
 from sharpfield.training.memory import GIB, SHARE, available_bytes, plan_parts
-from sharpfield.training.optim import adam, device_of
+from sharpfield.training.optim import adam
 
 Build = Callable[[int], Model]
 """Makes the model, on its device, with schedules for so many steps."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from torch.optim import Optimizer
 
+from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
@@ -16,7 +17,6 @@ from sharpfield.training.checkpoint import Progress, save_best, save_last
 from sharpfield.training.log import Log
 from sharpfield.training.loop import Hook
 from sharpfield.training.memory import Losses, peak_memory_mb
-from sharpfield.training.optim import device_of
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,14 @@ from typing import Any
 
 from rich.console import Console
 
+from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
 from sharpfield.training.checkpoint import Checkpoint, Progress, check_settings, recover, restore
 from sharpfield.training.hooks import every, every_seconds, finite
 from sharpfield.training.log import Log, LogLosses
 from sharpfield.training.loop import Hook, fit
-from sharpfield.training.optim import adam, device_of
+from sharpfield.training.optim import adam
 from sharpfield.training.plan import Build, Options, Plan, make_plan
 from sharpfield.training.record import Ledger, Record, read_ledger, write_ledger
 

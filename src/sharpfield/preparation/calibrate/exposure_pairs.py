@@ -29,11 +29,10 @@ from numba import njit
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import evenly_spread
-from sharpfield.core.tone import Tone, tone_of
+from sharpfield.core.tone import Tone, luma, tone_of
 from sharpfield.events.edi import FLOOR
 from sharpfield.events.index import EventIndex, first_since
 from sharpfield.events.site_colour import site_channels
-from sharpfield.metrics.image import luma
 from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light, neighbours
 
 MOST_WEIGHT = 4.0

@@ -16,9 +16,8 @@ from sharpfield.core.points import Growth
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
-from sharpfield.core.tone import tone_of
+from sharpfield.core.tone import luma, tone_of
 from sharpfield.formation.mix import mix, mix_of_few
-from sharpfield.formation.response import luma
 from sharpfield.geometry.normalise import centred
 from sharpfield.losses.event_counts import event_terms
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions, DynamicScene
@@ -181,7 +180,7 @@ class DynamicModel(nn.Module):
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
         """As the event camera sees it."""
-        return (luma(light)[..., 0] + self.floor).log()
+        return (luma(light) + self.floor).log()
 
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         """What becomes of the Gaussians after a step."""
