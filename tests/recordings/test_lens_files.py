@@ -6,7 +6,7 @@ import pytest
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.lens_files import ideal_pixels, read_calibration, seen_from
+from sharpfield.recordings.lens_files import read_calibration, resampling_map, undistorted_pixels
 
 SIZE = (240, 180)
 MATRIX = np.array([[335.5, 0.0, 129.9], [0.0, 335.25, 99.125], [0.0, 0.0, 1.0]])
@@ -85,11 +85,11 @@ def test_every_program_tells_the_same_lens(tmp_path):
 
 def test_how_cameras_stand_to_each_other(tmp_path):
     found = read_calibration(written(tmp_path / "cam_to_cam.yaml", DSEC))
-    there, back = found.between("cam0", "cam1"), found.between("cam1", "cam0")
+    there, back = found.other_from_camera("cam0", "cam1"), found.other_from_camera("cam1", "cam0")
     assert there is not None and back is not None
     np.testing.assert_allclose(there @ [1, 2, 3, 1], [-1.5, 1, 3, 1])
     np.testing.assert_allclose(back @ there, np.eye(4), atol=1e-12)
-    assert found.between("cam0", "camRect0") is None
+    assert found.other_from_camera("cam0", "camRect0") is None
 
 
 def test_a_fisheye(tmp_path):
@@ -105,31 +105,31 @@ def grid() -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(240.0), np.arange(180.0)), -1)
 
 
-def test_ideal_pixels_are_those_of_opencv():
+def test_undistorted_pixels_are_those_of_opencv():
     wanted = cv2.undistortPoints(
         grid().reshape(-1, 1, 2), MATRIX, np.array(BROWN), P=MATRIX
     ).reshape(180, 240, 2)
-    np.testing.assert_allclose(ideal_pixels(LENS), wanted, atol=1e-3)
+    np.testing.assert_allclose(undistorted_pixels(LENS), wanted, atol=1e-3)
 
 
-def test_where_ideal_pixels_lie_is_what_opencv_says():
+def test_where_undistorted_pixels_lie_is_what_opencv_says():
     ideal = Camera(240, 180, 335.5, 335.25, 130.4, 99.625)
     across, down = cv2.initUndistortRectifyMap(
         MATRIX, np.array(BROWN), None, MATRIX, SIZE, cv2.CV_32FC1
     )
-    np.testing.assert_allclose(seen_from(ideal, LENS), np.stack([across, down], -1), atol=1e-3)
+    np.testing.assert_allclose(resampling_map(ideal, LENS), np.stack([across, down], -1), atol=1e-3)
 
 
 def test_a_turned_camera_sees_far_points_elsewhere():
     ideal = Camera(240, 180, 335.5, 335.25, 130.4, 99.625)
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    found = seen_from(ideal, ideal, turn)
+    found = resampling_map(ideal, ideal, turn)
     np.testing.assert_allclose(
         found[99, 140],
         [129.9 - 335.5 * (99.5 - 99.625) / 335.25, 99.125 + 335.25 * 10.1 / 335.5],
         atol=1e-2,
     )
-    behind = seen_from(ideal, ideal, np.diag([1.0, -1, -1]))
+    behind = resampling_map(ideal, ideal, np.diag([1.0, -1, -1]))
     assert (behind < -1000).all(), "what lies behind is not in the image"
 
 

@@ -1,4 +1,4 @@
-"""What is known of the lenses: files of Kalibr, OpenCV, ROS, DSEC and RPG.
+"""Camera calibrations: files of Kalibr, OpenCV, ROS, DSEC and RPG.
 
     Kalibr      YAML: `cam0`, `cam1` ... each with intrinsics, distortion_coeffs, resolution
     DSEC        YAML: the same below `intrinsics`; `extrinsics` has T_10, T_21 ...
@@ -6,31 +6,40 @@
     ROS         YAML: the same, as mappings with `data`
     RPG         text: fx fy cx cy k1 k2 p1 p2 k3
 
-All of these count pixels from the centre of the first one, and this project from its corner: half
-a pixel is added to principal points.
+All of these put the origin of pixel coordinates at the centre of the first pixel, this project at
+its corner: half a pixel is added to principal points.
+
+YAML is read without anchors, aliases and types named by tags, so that a file can neither run code
+nor expand beyond its size.
 
 Source: Furgale et al., *Unified temporal and spatial calibration* (IROS 2013), for Kalibr.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import torch
+import yaml
 from jaxtyping import Float32, Float64
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.plain_yaml import read_yaml
 
-HALF = 0.5
+HALF_PIXEL = 0.5
 """From the centre of the first pixel to its corner."""
 
-ONLY = "camera"
-"""Name of the camera in a file of one."""
+SINGLE_CAMERA = "camera"
+"""Name of the camera in a file of only one."""
+
+MAX_BYTES, MAX_NESTING = 1 << 20, 32
+"""Limits of a YAML file: a calibration is a page or two."""
 
 BROWN = ("radtan", "plumb_bob", "brown", "radial-tangential")
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
@@ -42,17 +51,17 @@ Pose = Float64[np.ndarray, "4 4"]
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras by name, and how they stand to each other, where that is known."""
+    """Cameras by name, and their relative poses where the file gives them."""
 
     cameras: dict[str, Camera]
-    from_first: dict[str, Pose] = field(default_factory=dict[str, Pose])
-    """Takes points from the axes of the first camera to those of this one."""
+    camera_from_first: dict[str, Pose] = field(default_factory=dict[str, Pose])
+    """Transforms points from the axes of the first camera to those of each camera."""
 
     def camera(self, name: str | None, where: object) -> tuple[str, Camera]:
-        """A camera by name; the only one if there is one.
+        """A camera by name; without a name, the only one.
 
         Raises:
-            CaptureError: There is no such camera, or there are several and none is named.
+            CaptureError: There is no such camera, or there are several and no name was given.
         """
         if name is None and len(self.cameras) == 1:
             return next(iter(self.cameras.items()))
@@ -65,116 +74,194 @@ class Calibration:
             do="name one: " + ", ".join(self.cameras),
         )
 
-    def between(self, name: str, other: str) -> Pose | None:
-        """Takes points from the axes of one camera to those of another, if that is known."""
-        if not {name, other} <= self.from_first.keys():
+    def other_from_camera(self, name: str, other: str) -> Pose | None:
+        """Transform from the axes of one camera to those of another; None if it is unknown."""
+        if not {name, other} <= self.camera_from_first.keys():
             return None
-        return self.from_first[other] @ np.linalg.inv(self.from_first[name])
+        return self.camera_from_first[other] @ np.linalg.inv(self.camera_from_first[name])
 
 
 def read_calibration(path: Path, *, size: tuple[int, int] | None = None) -> Calibration:
-    """The cameras of a calibration file, recognised by what is in it.
+    """Read the cameras of a calibration file; its content decides which program wrote it.
 
     Args:
         path: The file.
-        size: Width and height of the sensor, where the file does not say.
+        size: Sensor resolution, width and height, where the file does not give it.
 
     Raises:
-        CaptureError: It is missing, or of no known kind, or a lens model is not known here.
+        CaptureError: The file is missing or of no known kind, or its lens model is not supported.
     """
     if not path.is_file():
         raise CaptureError("calibration not found", where=path)
     if path.suffix.lower() == ".xml":
-        return Calibration({ONLY: _opencv(_xml(path), size, path)})
+        return Calibration({SINGLE_CAMERA: _opencv(_xml(path), size, path)})
     numbers = _numbers(path)
     if numbers is not None:
-        return Calibration({ONLY: _rpg(numbers, size, path)})
-    found = read_yaml(path)
-    held = found.get("intrinsics", found)
+        return Calibration({SINGLE_CAMERA: _rpg(numbers, size, path)})
+    content = read_yaml(path)
+    entries = content.get("intrinsics", content)
     cameras = {
-        name: _kalibr(about, f"{path}, {name}", size)
-        for name, about in (held.items() if isinstance(held, Mapping) else ())
-        if isinstance(about, Mapping)
-        and ("intrinsics" in about or isinstance(about.get("camera_matrix"), list))
+        name: _kalibr(entry, f"{path}, {name}", size)
+        for name, entry in (entries.items() if isinstance(entries, Mapping) else ())
+        if isinstance(entry, Mapping)
+        and ("intrinsics" in entry or isinstance(entry.get("camera_matrix"), list))
     }
     if cameras:
-        return Calibration(cameras, _chain(found, list(cameras), path))
-    if "camera_matrix" in found or "cameraMatrix" in found or "K" in found:
-        return Calibration({ONLY: _opencv(found, size, path)})
+        return Calibration(cameras, _extrinsics(content, list(cameras), path))
+    if "camera_matrix" in content or "cameraMatrix" in content or "K" in content:
+        return Calibration({SINGLE_CAMERA: _opencv(content, size, path)})
     raise CaptureError(
         "no calibration of a known kind",
         where=path,
-        got=", ".join(found) or "nothing",
+        got=", ".join(content) or "nothing",
         do="give a file of Kalibr, OpenCV, ROS, DSEC, or a text `fx fy cx cy k1 k2 p1 p2 k3`",
     )
 
 
-def ideal_pixels(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
-    """Where each pixel's centre would be without the lens's distortion, in index units.
+def undistorted_pixels(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
+    """Position of each pixel centre in the image of an ideal pinhole camera, in index units.
 
-    10.0 is the centre of ideal pixel 10, as `core.events` has it for rectified events.
+    10.0 is the centre of undistorted pixel 10, as `core.events` has it for rectified events.
     """
     direction = camera.direction(camera.grid().double())
     plane = (direction[..., :2] / direction[..., 2:]).numpy()
     scale = np.array([camera.fx_px, camera.fy_px])
-    centre = np.array([camera.cx_px, camera.cy_px]) - HALF
+    centre = np.array([camera.cx_px, camera.cy_px]) - HALF_PIXEL
     return (plane * scale + centre).astype(np.float32)
 
 
-def seen_from(
-    ideal: Camera, real: Camera, turn: Float64[np.ndarray, "3 3"] | None = None
+def resampling_map(
+    ideal: Camera, real: Camera, real_from_ideal: Float64[np.ndarray, "3 3"] | None = None
 ) -> Float32[np.ndarray, "h w 2"]:
-    """Where each pixel of an ideal camera lies in the image of a real one, for `cv2.remap`.
+    """Position of each pixel of an ideal camera in the image of a real one, for `cv2.remap`.
 
     Args:
         ideal: The camera whose image is wanted.
         real: The camera that took the image.
-        turn: Takes directions from the ideal camera's axes to the real one's; where the two do not
-            stand in the same place this holds for far points only.
+        real_from_ideal: Rotation of directions from the ideal camera's axes to the real one's.
+            Where the cameras have different centres, this is exact for points at infinity only.
     """
     direction = ideal.direction(ideal.grid().double())
-    if turn is not None:
-        direction = direction @ torch.from_numpy(turn).T
+    if real_from_ideal is not None:
+        direction = direction @ torch.from_numpy(real_from_ideal).T
     behind = direction[..., 2] <= 0
     xy = real.project(torch.where(behind[..., None], torch.ones_like(direction), direction))
     xy[behind] = -1e4
-    return (xy - HALF).float().numpy()
+    return (xy - HALF_PIXEL).float().numpy()
 
 
-def _kalibr(about: Mapping[str, Any], where: str, size: tuple[int, int] | None) -> Camera:
-    intrinsics = _floats(about.get("intrinsics", about.get("camera_matrix")), where, "intrinsics")
-    if about.get("camera_model", "pinhole") != "pinhole" or len(intrinsics) != 4:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML mapping with text keys.
+
+    Raises:
+        CaptureError: The file is missing, too large, no mapping, or not such YAML.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise CaptureError("too large for a calibration", where=path)
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CaptureError("file not found", where=path) from None
+    except UnicodeDecodeError as error:
+        raise CaptureError("not a text", where=path, got=error) from None
+    # OpenCV writes the directive with a colon, and some programs indent with tabs.
+    text = text.replace("%YAML:", "%YAML ", 1).replace("\t", "    ")
+    found, line, problem = None, 1, "no mapping"
+    try:
+        found = yaml.load(text, _CalibrationLoader)
+        if found is None:
+            return {}
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = 1 if mark is None else mark.line + 1
+        problem = getattr(error, "problem", None) or error
+    if isinstance(found, dict):
+        return found
+    raise CaptureError(
+        "cannot read this YAML",
+        where=f"{path}, line {line}",
+        got=problem,
+        do="write plain mappings, lists and numbers, as Kalibr and OpenCV do",
+    )
+
+
+class _CalibrationLoader(yaml.SafeLoader):
+    """YAML without anchors, aliases, dates and base-60 numbers; keys are distinct texts.
+
+    Tags, such as OpenCV's `!!opencv-matrix`, change nothing: there is no constructor for any.
+    """
+
+    yaml_implicit_resolvers, yaml_constructors, _nesting = {}, {}, 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        event: Any = self.peek_event()
+        if getattr(event, "anchor", None) is not None:
+            raise ComposerError(None, None, "an anchor or alias", event.start_mark)
+        self._nesting += 1
+        if self._nesting > MAX_NESTING:
+            raise ComposerError(None, None, "nested too deeply", event.start_mark)
+        node = super().compose_node(parent, index)
+        self._nesting -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[str, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        if len(set(keys)) != len(node.value):
+            raise ConstructorError(None, None, "a key that is repeated or no text", node.start_mark)
+        values = (self.construct_object(value, deep=True) for _, value in node.value)
+        return dict(zip(keys, values, strict=True))
+
+
+_TAG = "tag:yaml.org,2002:"
+_PLAIN_VALUES: dict[str, tuple[str, Callable[[str], Any]]] = {
+    "null": ("~|null|Null|NULL|", lambda text: None),
+    "bool": ("true|True|TRUE|false|False|FALSE", lambda text: text.lower() == "true"),
+    "int": ("[-+]?[0-9]{1,18}", int),
+    "float": (r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?", float),
+}
+"""Pattern and conversion of what is no text, although it has no quotes."""
+
+for _name, (_pattern, _convert) in _PLAIN_VALUES.items():
+    _CalibrationLoader.add_implicit_resolver(_TAG + _name, re.compile(rf"({_pattern})\Z"), None)
+    _CalibrationLoader.add_constructor(
+        _TAG + _name, lambda loader, node, of=_convert: of(loader.construct_scalar(cast(Any, node)))
+    )
+
+
+def _kalibr(entry: Mapping[str, Any], where: str, size: tuple[int, int] | None) -> Camera:
+    intrinsics = _floats(entry.get("intrinsics", entry.get("camera_matrix")), where, "intrinsics")
+    if entry.get("camera_model", "pinhole") != "pinhole" or len(intrinsics) != 4:
         raise CaptureError(
             "unknown camera model",
             where=where,
-            got=f"{about.get('camera_model')} with {len(intrinsics)} intrinsics",
+            got=f"{entry.get('camera_model')} with {len(intrinsics)} intrinsics",
             do="calibrate with pinhole-radtan or pinhole-equi",
         )
-    told = about.get("resolution")
-    stated = tuple(int(n) for n in _floats(told, where, "resolution")) if told else None
+    stored = entry.get("resolution")
+    stated = tuple(int(n) for n in _floats(stored, where, "resolution")) if stored else None
     return _camera(
         intrinsics,
-        str(about.get("distortion_model", "none")),
-        _floats(about.get("distortion_coeffs", []), where, "distortion_coeffs"),
+        str(entry.get("distortion_model", "none")),
+        _floats(entry.get("distortion_coeffs", []), where, "distortion_coeffs"),
         (stated[0], stated[1]) if stated and len(stated) == 2 else size,
         where,
     )
 
 
-def _opencv(found: Mapping[str, Any], size: tuple[int, int] | None, path: Path) -> Camera:
+def _opencv(content: Mapping[str, Any], size: tuple[int, int] | None, path: Path) -> Camera:
     def first(*names: str) -> Any:
-        return next((found[name] for name in names if name in found), None)
+        return next((content[name] for name in names if name in content), None)
 
-    matrix = _floats(_data(first("camera_matrix", "cameraMatrix", "K")), path, "camera_matrix")
+    matrix = _floats(_flat(first("camera_matrix", "cameraMatrix", "K")), path, "camera_matrix")
     if len(matrix) != 9:
         raise CaptureError("a camera matrix has nine numbers", where=path, got=len(matrix))
     stored = first("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
-    coefficients = [] if stored is None else _floats(_data(stored), path, "distortion")
-    model = str(found.get("distortion_model", "plumb_bob" if coefficients else "none"))
-    if found.get("fisheye_model") in (1, True):
+    coefficients = [] if stored is None else _floats(_flat(stored), path, "distortion")
+    model = str(content.get("distortion_model", "plumb_bob" if coefficients else "none"))
+    if content.get("fisheye_model") in (1, True):
         model = "fisheye"
-    if all(name in found for name in SIZE_KEYS):
-        size = int(found[SIZE_KEYS[0]]), int(found[SIZE_KEYS[1]])
+    if all(name in content for name in SIZE_KEYS):
+        size = int(content[SIZE_KEYS[0]]), int(content[SIZE_KEYS[1]])
     intrinsics = [matrix[0], matrix[4], matrix[2], matrix[5]]
     return _camera(intrinsics, model, coefficients, size, path)
 
@@ -192,13 +279,13 @@ def _camera(
 ) -> Camera:
     if size is None:
         raise CaptureError(
-            "the calibration does not say the size of the image",
+            "the calibration does not give the image size",
             where=where,
-            do="give width and height in pixels",
+            do="give the sensor resolution, WIDTHxHEIGHT",
         )
     fx, fy, cx, cy = intrinsics
     lens, distortion = _lens(model.lower(), list(coefficients), where)
-    return Camera(*size, fx, fy, cx + HALF, cy + HALF, lens, distortion)
+    return Camera(*size, fx, fy, cx + HALF_PIXEL, cy + HALF_PIXEL, lens, distortion)
 
 
 def _lens(model: str, coefficients: list[float], where: object) -> tuple[str, tuple[float, ...]]:
@@ -216,28 +303,28 @@ def _lens(model: str, coefficients: list[float], where: object) -> tuple[str, tu
     )
 
 
-def _chain(found: Mapping[str, Any], names: list[str], path: Path) -> dict[str, Pose]:
-    """How each camera stands to the first, from what each says of the one before it."""
-    extrinsics = found.get("extrinsics", {})
-    known = {names[0]: np.eye(4)}
+def _extrinsics(content: Mapping[str, Any], names: list[str], path: Path) -> dict[str, Pose]:
+    """Pose of each camera, chained from the transforms between consecutive cameras."""
+    extrinsics = content.get("extrinsics", {})
+    camera_from_first = {names[0]: np.eye(4)}
     for i, name in enumerate(names[1:], start=1):
-        about = found.get(name)
-        told = about.get("T_cn_cnm1") if isinstance(about, Mapping) else None
-        if told is None and isinstance(extrinsics, Mapping):
-            told = extrinsics.get(f"T_{i}{i - 1}")
-        if told is None or names[i - 1] not in known:
+        entry = content.get(name)
+        stored = entry.get("T_cn_cnm1") if isinstance(entry, Mapping) else None
+        if stored is None and isinstance(extrinsics, Mapping):
+            stored = extrinsics.get(f"T_{i}{i - 1}")
+        if stored is None or names[i - 1] not in camera_from_first:
             break
-        step = np.array([_floats(row, path, "an extrinsic") for row in told], np.float64)
+        step = np.array([_floats(row, path, "an extrinsic") for row in stored], np.float64)
         if step.shape != (4, 4) or not np.allclose(
             step[:3, :3] @ step[:3, :3].T, np.eye(3), atol=1e-3
         ):
             raise CaptureError("not a rigid motion", where=f"{path}, {name}", got=step.tolist())
-        known[name] = step @ known[names[i - 1]]
-    return known
+        camera_from_first[name] = step @ camera_from_first[names[i - 1]]
+    return camera_from_first
 
 
-def _data(stored: Any) -> Any:
-    """The numbers of a matrix: a list, nested or not, or a mapping with `data`."""
+def _flat(stored: Any) -> Any:
+    """Numbers of a matrix that is stored as a list, nested or not, or as a mapping with `data`."""
     if isinstance(stored, Mapping):
         stored = stored.get("data", [])
     return np.ravel(np.array(stored)).tolist() if isinstance(stored, list) else stored
@@ -251,7 +338,7 @@ def _floats(stored: Any, where: object, what: str) -> list[float]:
 
 
 def _numbers(path: Path) -> list[float] | None:
-    """The nine (or eight, or four) numbers that a text of RPG is made of."""
+    """The 9 (or 8, or 4) numbers of RPG's calib.txt; None if it is another file."""
     try:
         numbers = [float(word) for word in path.read_text(encoding="utf-8").split()]
     except (ValueError, UnicodeDecodeError):

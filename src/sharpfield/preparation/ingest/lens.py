@@ -17,7 +17,12 @@ from jaxtyping import Float32, Float64, Shaped
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, SiteColour
-from sharpfield.recordings.lens_files import Calibration, ideal_pixels, read_calibration, seen_from
+from sharpfield.recordings.lens_files import (
+    Calibration,
+    read_calibration,
+    resampling_map,
+    undistorted_pixels,
+)
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -117,7 +122,7 @@ def geometry(events: Size | None, frames: Size | None, optics: Optics, where: ob
     name, camera = known.camera(optics.camera, optics.calibration)
     _expect_size(camera, size, f"{optics.calibration}, {name}")
     ideal = replace(camera, lens="pinhole", distortion=()) if optics.rectify else camera
-    sites = ideal_pixels(camera) if ideal != camera and events is not None else None
+    sites = undistorted_pixels(camera) if ideal != camera and events is not None else None
     if optics.frame_camera is not None and frames is not None:
         made = _from_beside(ideal, known, name, frames, optics)
         return replace(made, sites=sites)
@@ -128,10 +133,10 @@ def geometry(events: Size | None, frames: Size | None, optics: Optics, where: ob
             camera.scaled(frames[0] / size[0]), width=frames[0], height=frames[1]
         )
         if ideal != camera:
-            frame_map = seen_from(ideal, camera_of_frames)
+            frame_map = resampling_map(ideal, camera_of_frames)
             return Geometry(ideal, frame_map, sites=sites, separate=True)
         return Geometry(ideal, frame_size=size, sites=sites, separate=True)
-    return Geometry(ideal, seen_from(ideal, camera) if ideal != camera else None, sites=sites)
+    return Geometry(ideal, resampling_map(ideal, camera) if ideal != camera else None, sites=sites)
 
 
 def no_events(size: Size) -> EventStream:
@@ -163,7 +168,7 @@ def _from_beside(
     """Frames of another camera, seen from where the events were."""
     other, camera = known.camera(optics.frame_camera, optics.calibration)
     _expect_size(camera, frames, f"{optics.calibration}, {other}")
-    pose = known.between(name, other)
+    pose = known.other_from_camera(name, other)
     if pose is None:
         raise CaptureError(
             "the calibration does not say how the two cameras stand to each other",
@@ -174,7 +179,7 @@ def _from_beside(
     turn: Float64[np.ndarray, "3 3"] = pose[:3, :3]
     return Geometry(
         ideal,
-        seen_from(ideal, camera, turn),
+        resampling_map(ideal, camera, turn),
         separate=True,
         notes={"frame_camera_distance": float(np.linalg.norm(pose[:3, 3]))},
     )

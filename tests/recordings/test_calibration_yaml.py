@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.plain_yaml import read_yaml
+from sharpfield.recordings.lens_files import read_yaml
 
 
 def parsed(tmp_path, text: str):
@@ -27,6 +27,10 @@ def parsed(tmp_path, text: str):
         ("a:\n- b: 1\n  c: 2\n- b: 3\n", {"a": [{"b": 1, "c": 2}, {"b": 3}]}),
         ("%YAML:1.0\n---\nm: !!opencv-matrix\n   dt: d\n   data: [ 1.,\n 2. ]\n",
          {"m": {"dt": "d", "data": [1.0, 2.0]}}),
+        ("a: |\n  long\n  text\n", {"a": "long\ntext\n"}),
+        ("a: {b 1}\n", {"a": {"b 1": None}}),
+        ("a: on\nb: 1:30\nc: 012\nd: 2001-01-01\ne: 1e-3\nf: 2e5\n",
+         {"a": "on", "b": "1:30", "c": 12, "d": "2001-01-01", "e": 0.001, "f": 2e5}),
         ('t: /cam0/image_raw\nq: "a: b"\n', {"t": "/cam0/image_raw", "q": "a: b"}),
     ],
 )  # fmt: skip
@@ -38,8 +42,8 @@ def test_what_calibration_programs_write(tmp_path, text, wanted):
     "text",
     [
         "a: [1, 2\n", "a: ]\n", "a: 1\n   b: 2\n", "just words\n", "a: &x 1\nb: *x\n",
-        "a: |\n  long\n  text\n", "- 1\n- 2\n", "a: [1 2] 3\n", "a: {b 1}\n", "a: {1: [}\n",
-        "a: !!python/object:os.system [x]\n  b: 1\n",
+        "- 1\n- 2\n", "a: [1 2] 3\n", "a: {1: [}\n", "a: 1\nb: 2\na: 3\n", "[a]: 1\n",
+        "a: !!python/object:os.system [x]\n  b: 1\n", "a: !!int x\n", "a: !!int [1]\n",
     ],
 )  # fmt: skip
 def test_all_else_is_refused_with_its_line(tmp_path, text):
@@ -48,8 +52,9 @@ def test_all_else_is_refused_with_its_line(tmp_path, text):
     assert "line" in str(caught.value)
 
 
-def test_tags_name_no_code(tmp_path):
-    assert parsed(tmp_path, "a: !!python/name:os.system x\n") == {"a": "x"}
+@pytest.mark.parametrize("tag", ["!python/name:os.system", "!python/object/apply:os.getcwd", "own"])
+def test_tags_name_no_code(tmp_path, tag):
+    assert parsed(tmp_path, f"a: !{tag} x\nb: !{tag} [y]\n") == {"a": "x", "b": ["y"]}
 
 
 def test_depth_and_length_are_bounded(tmp_path):
