@@ -17,8 +17,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.frames import FrameSensor
@@ -79,8 +78,7 @@ def main() -> None:
         capture = recorded(CAMERAS[name], parse_size(asked.size), asked.seed)
         run, source = (asked.out / name.replace(", ", "-") / part for part in ("run", "capture"))
         native.write(capture, source)
-        recipe = recipe_named("ev-splat")()
-        recipe = prepared("ev-splat", recipe, "draft", capture=capture, device="cpu")
+        recipe = prepared("ev-splat", "draft", capture=capture, device="cpu")
         started = RunConfig("ev-splat", recipe, str(source.resolve()), asked.seed)
         options = Options(steps=asked.steps)
         start(started, capture, run, options, device="cpu", console=Console())

@@ -18,8 +18,7 @@ from sharpfield.captures.read import read
 from sharpfield.captures.summary import downscaled
 from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run, start
 from sharpfield.training.plan import Options
@@ -43,9 +42,7 @@ def main() -> None:
     rows: list[Row] = []
     for name in asked.recipes:
         run = asked.out / name
-        recipe = prepared(
-            name, recipe_named(name)(), "draft", capture=native.read(folder), device="cpu"
-        )
+        recipe = prepared(name, "draft", capture=native.read(folder), device="cpu")
         started = RunConfig(name, recipe, str(folder.resolve()), asked.seed)
         options = Options(minutes=asked.minutes)
         start(started, native.read(folder), run, options, device="cpu", console=Console())

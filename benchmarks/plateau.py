@@ -19,8 +19,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.cameras.rigs import ring
@@ -64,7 +63,7 @@ RACES = {
 def round_of(name: str, minutes: float, capture: Path, run: Path, device: str) -> Row:
     """Train for a time and score the result."""
     race, console, seen = RACES[name], Console(), native.read(capture)
-    recipe = prepared(name, recipe_named(name)(), "draft", capture=seen, device=device)
+    recipe = prepared(name, "draft", capture=seen, device=device)
     started = RunConfig(name, recipe, str(capture.resolve()), 0, use=race.use)
     start(started, seen, run, Options(minutes=minutes), device=device, console=console)
     mean = measure(open_run(run, device=device), run, console)["mean"]

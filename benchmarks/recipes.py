@@ -21,8 +21,7 @@ from sharpfield.captures.read import read
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
@@ -115,7 +114,6 @@ def _compete(
     run = out / contender.name.replace(", ", "-").replace(" ", "-")
     recipe = prepared(
         contender.recipe,
-        recipe_named(contender.recipe)(),
         contender.preset,
         capture=native.read(source),
         device=asked.device,

@@ -24,8 +24,7 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.sensors.event_pixels import EventSensor
@@ -112,9 +111,7 @@ def main() -> None:
     presets = {"believed": "draft", "refined": "refine,draft"}
     for name, preset in ((name, presets[name]) for name in asked.only):
         run = asked.out / name
-        recipe = prepared(
-            "ev-splat", recipe_named("ev-splat")(), preset, capture=capture, device="cpu"
-        )
+        recipe = prepared("ev-splat", preset, capture=capture, device="cpu")
         recipe = replace(recipe, unknowns=replace(recipe.unknowns, threshold=GUESS))
         started = RunConfig("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
         start(started, capture, run, options, device="cpu", console=console)

@@ -22,8 +22,7 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.cli.runs import changed
 from sharpfield.core.capture import Capture
 from sharpfield.evaluation.evaluate import Measuring
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import measure, open_run, start
 from sharpfield.simulation.simulate_room import ROOM_RIG, RoomTiming, simulate_room
@@ -108,9 +107,7 @@ def _compete(
     contender: Contender, capture: Capture, source: Path, run: Path, asked: argparse.Namespace
 ) -> Row:
     console, name = Console(), contender.recipe
-    recipe = prepared(
-        name, recipe_named(name)(), contender.preset, capture=capture, device=asked.device
-    )
+    recipe = prepared(name, contender.preset, capture=capture, device=asked.device)
     recipe = changed(recipe, contender.changes)
     started = RunConfig(name, recipe, str(source.resolve()), asked.seed)
     options = Options(steps=asked.steps) if asked.steps else Options(minutes=asked.minutes)

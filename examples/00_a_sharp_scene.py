@@ -14,8 +14,7 @@ import torch
 import tyro
 
 from sharpfield.metrics.image import psnr
-from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.rendering.view import render_view
 from sharpfield.report.colormaps import eight_bit
 from sharpfield.simulation.simulate import Rig, Timing, simulate
@@ -32,9 +31,7 @@ def main(
     frames = capture.needed_frames
 
     # A recipe is a paper's numbers; presets shrink them to what this machine can take.
-    recipe = prepared(
-        "ev-deblur-nerf", EvDeblurNeRF(), "physical,draft", capture=capture, device="cpu"
-    )
+    recipe = prepared("ev-deblur-nerf", "physical,draft", capture=capture, device="cpu")
     model = recipe.lasting(steps).build(capture, seed=0)
     fit(model, adam(model), steps=range(steps))
 

@@ -20,8 +20,7 @@ from sharpfield.core.measurements import Batch
 from sharpfield.core.paper import Paper
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes.nerf import NeRF
-from sharpfield.recipes.presets import nerf_draft
+from sharpfield.recipes.nerf import NeRF, draft
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.hooks import every
 from sharpfield.training.loop import fit
@@ -36,7 +35,7 @@ class MeanBlur:
     steps: int = 100
     instants: int = 7
     """Sharp rays behind each pixel."""
-    nerf: NeRF = replace(nerf_draft(NeRF()), pixels=256)
+    nerf: NeRF = replace(draft(NeRF()), pixels=256)
 
     def lasting(self, steps: int) -> "MeanBlur":
         """The same recipe with another length."""

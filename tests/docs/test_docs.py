@@ -20,7 +20,7 @@ from sharpfield.cli import main as command_line
 from sharpfield.cli.runs import changed
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.presets import names
+from sharpfield.recipes.choose import presets_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "notebook.md"]
@@ -86,7 +86,7 @@ def test_commands_are_understood(page: str, line: str, parse: Callable[[str], Ca
         made = recipe_named(recipe)()
         if choice is not None:
             presets = [preset for preset in choice.preset.split(",") if preset]
-            assert set(presets) <= names(recipe).keys(), page
+            assert set(presets) <= presets_of(made).all.keys(), page
             changed(made, choice.change)
 
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
+from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.nerf import NeRF
-from sharpfield.recipes.presets import SIZES, VARIANTS, prepared
 from sharpfield.recipes.volume.scene import VolumeOptions
 from sharpfield.rendering.view import render_view
 from sharpfield.training.loop import fit
@@ -46,9 +46,7 @@ def small(recipe: Any, *, kind: str = "planes") -> Any:
 
 def variant(name: str, capture: Capture) -> Any:
     """A named variant of the recipe, small."""
-    full = prepared(
-        "ev-deblur-nerf", EvDeblurNeRF(), f"{name},paper", capture=capture, device="cpu"
-    )
+    full = prepared("ev-deblur-nerf", f"{name},paper", capture=capture, device="cpu")
     return small(full)
 
 
@@ -67,7 +65,7 @@ def train(model: Any, steps: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "streams"),
-    [(name, "both") for name in sorted(VARIANTS["ev-deblur-nerf"])]
+    [(name, "both") for name in sorted(EvDeblurNeRF.presets.variants)]
     + [("physical", "frames"), ("physical", "events"), ("cdavis_full", "frames")],
 )
 def test_every_variant_learns_from_whatever_there_is(
@@ -113,9 +111,7 @@ def test_every_field_trains_and_renders(tiny: Capture, kind: str) -> None:
 
 def prepared_physical(capture: Capture) -> Any:
     """The physical variant at full size."""
-    return prepared(
-        "ev-deblur-nerf", EvDeblurNeRF(), "physical,paper", capture=capture, device="cpu"
-    )
+    return prepared("ev-deblur-nerf", "physical,paper", capture=capture, device="cpu")
 
 
 def test_a_step_depends_on_seed_and_step_alone(tiny: Capture) -> None:
@@ -192,21 +188,20 @@ def test_published_rates_and_prior_weights(tiny: Capture) -> None:
 
 def test_unknown_presets_are_named(tiny: Capture) -> None:
     with pytest.raises(OptionError, match="no preset 'blender'"):
-        prepared("ev-deblur-nerf", EvDeblurNeRF(), "blender", capture=tiny, device="cpu")
+        prepared("ev-deblur-nerf", "blender", capture=tiny, device="cpu")
 
 
 def test_presets_left_open_follow_the_machine(tiny: Capture) -> None:
     draft, standard = (
-        prepared("ev-deblur-nerf", EvDeblurNeRF(), "", capture=tiny, device=device)
-        for device in ("cpu", "cuda")
+        prepared("ev-deblur-nerf", "", capture=tiny, device=device) for device in ("cpu", "cuda")
     )
     assert draft.frames.blur == standard.frames.blur == "auto"
     assert draft.steps < standard.steps
-    paper = prepared("ev-deblur-nerf", EvDeblurNeRF(), "paper", capture=tiny, device="cpu")
+    paper = prepared("ev-deblur-nerf", "paper", capture=tiny, device="cpu")
     assert paper.volume.precision == "auto", "which changes no result by more than noise"
     paper = replace(paper, volume=replace(paper.volume, precision="float32"))
     assert paper == EvDeblurNeRF(), "the recipe's defaults are the paper's synthetic numbers"
-    assert set(SIZES["ev-deblur-nerf"]) == {"draft", "standard", "paper"}
+    assert set(EvDeblurNeRF.presets.sizes) == {"draft", "standard", "paper"}
 
 
 def _finite(terms: dict[str, Tensor]) -> bool:

@@ -14,8 +14,7 @@ from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.runs import OPTIONS, READING, Choice, changed
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.splats.merge import merge
 from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
 from sharpfield.runs.run import ReadOptions, device_named, open_run, start
@@ -69,7 +68,7 @@ def blocks(
         raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
     console, where, count = screen(), device_named(device), choice.count
     source = read(capture, **reading.given())
-    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = prepared(recipe, choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
     whole = RunConfig(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]

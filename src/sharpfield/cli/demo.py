@@ -12,8 +12,7 @@ from sharpfield.cli.arguments import Device, Size, parse_size, screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.preparation.deblur import DeblurOptions, deblur
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.report.tables import markdown, methods_table
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import device_named, measure, open_run, start
@@ -108,9 +107,7 @@ def _compete(
     where = device_named(device)
     source = out / ("capture-edi" if contender.deblurred else "capture")
     capture = native.read(source)
-    recipe = prepared(
-        contender.recipe, recipe_named(contender.recipe)(), "draft", capture=capture, device=where
-    )
+    recipe = prepared(contender.recipe, "draft", capture=capture, device=where)
     started = RunConfig(contender.recipe, recipe, str(source.resolve()), seed, contender.use)
     options = Options(minutes=minutes, validate_every=200)
     start(started, capture, run, options, device=where, console=console)

@@ -7,8 +7,8 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes import all_recipes, recipe_named
-from sharpfield.recipes.presets import names
+from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes.choose import presets_of
 
 WIDTH = 96
 
@@ -23,22 +23,20 @@ def recipes(
         name: Of the recipe, for describe and cite.
     """
     if what == "list":
-        for known, recipe in all_recipes().items():
+        for known, recipe in RECIPES.working().items():
             print(f"{known:<18} {_first_line(recipe)}")
         return
     if not name:
-        raise OptionError(
-            f"which recipe? {what} needs a name", do=f"use {', '.join(all_recipes())}"
-        )
+        raise OptionError(f"which recipe? {what} needs a name", do=f"use {', '.join(RECIPES)}")
     recipe = recipe_named(name)
     print(_described(name, recipe) if what == "describe" else _cited(recipe))
 
 
 def _described(name: str, recipe: Any) -> str:
     lines = [f"{name}: {recipe.paper.title}", "", _first_line(recipe), ""]
-    if known := names(name):
+    if known := presets_of(recipe).all:
         lines.append("presets")
-        lines += [f"  {preset:<16} {meaning}" for preset, meaning in known.items()]
+        lines += [f"  {preset:<16} {_first_line(change)}" for preset, change in known.items()]
         lines.append("")
     lines += ["numbers (train --change NAME=VALUE)", *_numbers(recipe())]
     return "\n".join(lines)

@@ -19,8 +19,7 @@ from sharpfield.evaluation.paths import camera_path
 from sharpfield.evaluation.refine import Refinement, refine_poses
 from sharpfield.evaluation.report import flat
 from sharpfield.metrics.lpips import load_lpips
-from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.video import write_video
 from sharpfield.runs.config import RunConfig
@@ -72,7 +71,7 @@ def train(
     """
     console, where = screen(), device_named(device)
     source = read(capture, **reading.given())
-    made = prepared(recipe, recipe_named(recipe)(), choice.preset, capture=source, device=where)
+    made = prepared(recipe, choice.preset, capture=source, device=where)
     made = changed(made, choice.change)
     where_from, given = str(capture.resolve()), reading.given()
     started = RunConfig(recipe, made, where_from, seed, choice.use, given, choice.block)

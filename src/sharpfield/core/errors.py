@@ -8,6 +8,8 @@ Optional packages: imported where they are used, with an error that names the ex
 """
 
 import importlib
+from collections.abc import Iterable
+from difflib import get_close_matches
 from types import ModuleType
 
 
@@ -45,6 +47,18 @@ class RunError(SharpfieldError):
 
 class OptionError(SharpfieldError):
     """An option, or a combination of options, makes no sense."""
+
+
+class Hint(UserWarning):
+    """Something still works, or was left out; the command line prints it as one line."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """What to do about an unknown name: the known ones, the most similar first."""
+    names = list(known)
+    if close := get_close_matches(name, names, n=1):
+        return f"did you mean {close[0]}? There are {', '.join(names)}"
+    return f"use one of {', '.join(names)}" if names else "leave it out: there is none"
 
 
 class MissingExtra(SharpfieldError):

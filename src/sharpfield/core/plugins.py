@@ -16,8 +16,10 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from sharpfield.core.errors import Hint
 
-class PluginWarning(UserWarning):
+
+class PluginWarning(Hint):
     """An installed package offers something that cannot be used."""
 
 

@@ -1,46 +1,34 @@
-"""Recipes: one paper, one file.
+"""Recipes: one paper, one file. They are imported when they are asked for.
 
 A package of your own adds recipes by the entry point `sharpfield.recipes`.
 """
 
-from importlib.metadata import entry_points
 from typing import Any
 
-from sharpfield.core.errors import OptionError
-from sharpfield.recipes.d_nerf import DNeRF
-from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
-from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
-from sharpfield.recipes.evdnerf import EvDNeRF
-from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical
-from sharpfield.recipes.hybrid import Hybrid
-from sharpfield.recipes.nerf import NeRF
-from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.splat import BlurSplat, EdiSplat, EventSplat, EvSplat, RoomSplat, Splat
+from sharpfield.core.errors import OptionError, did_you_mean
+from sharpfield.core.plugins import Registry
 
-RECIPES: dict[str, Any] = {
-    "nerf": NeRF,
-    "ev-deblur-nerf": EvDeblurNeRF,
-    "d-nerf": DNeRF,
-    "evdnerf": EvDNeRF,
-    "evdnerf-physical": EvDNeRFPhysical,
-    "dynamic-splat": DynamicSplat,
-    "ev-dynamic-splat": EvDynamicSplat,
-    "point-nerf": PointNeRF,
-    "hybrid": Hybrid,
-    "splat": Splat,
-    "edi-splat": EdiSplat,
-    "blur-splat": BlurSplat,
-    "event-splat": EventSplat,
-    "ev-splat": EvSplat,
-    "room-splat": RoomSplat,
-}
-"""By the name that the command line knows."""
-
-
-def all_recipes() -> dict[str, Any]:
-    """Ours and those of installed packages."""
-    others = {entry.name: entry.load() for entry in entry_points(group="sharpfield.recipes")}
-    return {**others, **RECIPES}
+RECIPES = Registry(
+    "sharpfield.recipes",
+    {
+        "nerf": "sharpfield.recipes.nerf:NeRF",
+        "ev-deblur-nerf": "sharpfield.recipes.ev_deblur_nerf:EvDeblurNeRF",
+        "d-nerf": "sharpfield.recipes.d_nerf:DNeRF",
+        "evdnerf": "sharpfield.recipes.evdnerf:EvDNeRF",
+        "evdnerf-physical": "sharpfield.recipes.evdnerf_physical:EvDNeRFPhysical",
+        "dynamic-splat": "sharpfield.recipes.dynamic_splat:DynamicSplat",
+        "ev-dynamic-splat": "sharpfield.recipes.dynamic_splat:EvDynamicSplat",
+        "point-nerf": "sharpfield.recipes.point_nerf:PointNeRF",
+        "hybrid": "sharpfield.recipes.hybrid:Hybrid",
+        "splat": "sharpfield.recipes.splat:Splat",
+        "edi-splat": "sharpfield.recipes.splat:EdiSplat",
+        "blur-splat": "sharpfield.recipes.splat:BlurSplat",
+        "event-splat": "sharpfield.recipes.splat:EventSplat",
+        "ev-splat": "sharpfield.recipes.splat:EvSplat",
+        "room-splat": "sharpfield.recipes.splat:RoomSplat",
+    },
+)
+"""Classes by the name that the command line knows; those of other packages included."""
 
 
 def recipe_named(name: str) -> Any:
@@ -49,29 +37,7 @@ def recipe_named(name: str) -> Any:
     Raises:
         OptionError: There is none of this name.
     """
-    known = all_recipes()
-    if name not in known:
-        raise OptionError("unknown recipe", got=name, do=f"use one of {', '.join(known)}")
-    return known[name]
-
-
-__all__ = [
-    "RECIPES",
-    "BlurSplat",
-    "DNeRF",
-    "EvDNeRF",
-    "EvDNeRFPhysical",
-    "DynamicSplat",
-    "EdiSplat",
-    "EvDeblurNeRF",
-    "EvDynamicSplat",
-    "EvSplat",
-    "EventSplat",
-    "Hybrid",
-    "NeRF",
-    "PointNeRF",
-    "RoomSplat",
-    "Splat",
-    "all_recipes",
-    "recipe_named",
-]
+    recipe = RECIPES.get(name)
+    if recipe is None:
+        raise OptionError("unknown recipe", got=name, do=did_you_mean(name, RECIPES))
+    return recipe

@@ -19,6 +19,7 @@ from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
 from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
@@ -45,11 +46,31 @@ PAPER = Paper(
 )
 
 
+def draft(recipe: "DNeRF") -> "DNeRF":
+    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
+    scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
+    return replace(recipe.lasting(2000), rate=2e-3, pixels=256, scene=scene)
+
+
+def standard(recipe: "DNeRF") -> "DNeRF":
+    """Half as wide; for a GPU."""
+    scene = replace(recipe.scene, width=128, samples=(48, 64))
+    return replace(recipe.lasting(40_000), rate=1e-3, pixels=1024, scene=scene)
+
+
+def published(recipe: "DNeRF") -> "DNeRF":
+    """The published networks and length."""
+    return recipe
+
+
 @dataclass(frozen=True)
 class DNeRF:
     """Frames of a moving scene, through a canonical scene and a deformation."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        sizes={"draft": draft, "standard": standard, "paper": published}
+    )
 
     steps: int = 800_000
     """Length of the schedule."""

@@ -10,6 +10,7 @@ from typing import ClassVar, TypeVar
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.splats.dynamic_model import DynamicModel
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
@@ -47,11 +48,26 @@ OURS = Paper(
 )
 
 
+def draft(recipe: "DynamicSplat") -> "DynamicSplat":
+    """Minutes on two CPU cores."""
+    return recipe.lasting(8000)
+
+
+def standard(recipe: "DynamicSplat") -> "DynamicSplat":
+    """More Gaussians, and more cameras and instants in each step; an hour on a CPU."""
+    return replace(
+        recipe.lasting(20_000),
+        gaussians=replace(recipe.gaussians, density=1.5, density_moving=4.5),
+        looks=replace(recipe.looks, cameras=4, instants=5),
+    )
+
+
 @dataclass(frozen=True)
 class DynamicSplat:
     """Moving Gaussians from frames alone. What events must beat."""
 
     paper: ClassVar[Paper] = LI
+    presets: ClassVar[Presets] = Presets(sizes={"draft": draft, "standard": standard})
 
     steps: int = 10_000
     """Length of the schedule."""

@@ -20,6 +20,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.core.tone import tone_of
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.volume.event_term import EventOptions, EventTerm
 from sharpfield.recipes.volume.frame_terms import (
     FrameOptions,
@@ -31,7 +32,14 @@ from sharpfield.recipes.volume.frame_terms import (
     Terms,
 )
 from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, trust
-from sharpfield.recipes.volume.scene import Volume, VolumeOptions, stages
+from sharpfield.recipes.volume.scene import (
+    DRAFT,
+    GRID_RATE,
+    STANDARD,
+    Volume,
+    VolumeOptions,
+    stages,
+)
 
 PAPER = Paper(
     key="cannici2024evdeblurnerf",
@@ -68,11 +76,123 @@ PAPER = Paper(
 )
 
 
+NETWORK_RATE = 5e-3
+"""Learning rate of the networks beside a dense grid: the published one."""
+
+
+def blender_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """The paper's recipe for its synthetic data."""
+    return replace(
+        recipe,
+        smooth=1.0,
+        frames=FrameOptions(),
+        kernel=KernelOptions(),
+        events=EventOptions(),
+        prior=PriorOptions(),
+    )
+
+
+def blender_minus(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """Ev-DeblurNeRF--: no prior and no learned response; events follow display values."""
+    return replace(
+        blender_full(recipe),
+        events=EventOptions(response="gamma"),
+        prior=PriorOptions(weight=0.0),
+    )
+
+
+def cdavis_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """The paper's recipe for its real data: colour events; frames count once blur is modelled."""
+    return replace(
+        blender_full(recipe),
+        frames=FrameOptions(frames_from=1201),
+        events=EventOptions(pairs=2048, threshold=(0.25, 0.25), half_pixel=False),
+        prior=PriorOptions(weight=1.0, end=1.0),
+    )
+
+
+def physical(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """Known motion instead of a learned kernel, sharp targets all along each exposure."""
+    return replace(
+        recipe,
+        smooth=0.02,
+        volume=replace(recipe.volume, noise=0.0, density="softplus"),
+        frames=FrameOptions(blur="auto", blurred_pixels=256, blur_from=20_000),
+        kernel=KernelOptions(integration="samples", norm="layer"),
+        events=EventOptions(response="residual"),
+        prior=PriorOptions(weight=1.0, end=0.1, until=30_000, domain="linear"),
+    )
+
+
+def draft(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """Minutes on two CPU cores: a dense grid instead of planes and networks."""
+    recipe = recipe.lasting(2000)
+    frames = recipe.frames
+    frames = replace(
+        frames,
+        pixels=min(frames.pixels, 768),
+        blurred_pixels=min(frames.blurred_pixels, 192),
+        instants=min(frames.instants, 5),
+        blur_from=min(frames.blur_from, 800),
+    )
+    return replace(
+        recipe,
+        rate=GRID_RATE,
+        decay=1000,
+        smooth=0.0,
+        volume=replace(recipe.volume, **DRAFT),
+        frames=frames,
+        kernel=replace(recipe.kernel, rate=NETWORK_RATE),
+        events=replace(
+            recipe.events, pairs=512, weight=2 * recipe.events.weight, rate=NETWORK_RATE
+        ),
+    )
+
+
+def standard(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """Minutes on a GPU, hours on a CPU."""
+    return replace(recipe.lasting(10_000), volume=replace(recipe.volume, **STANDARD))
+
+
+def published(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
+    """The published size and length."""
+    whole = VolumeOptions()
+    volume = replace(
+        recipe.volume,
+        voxels=whole.voxels,
+        channels=whole.channels,
+        coarse=whole.coarse,
+        fine=whole.fine,
+        octaves=whole.octaves,
+        samples=whole.samples,
+        precision="auto",
+    )
+    return replace(recipe.lasting(30_000), rate=5e-3, volume=volume)
+
+
+def variant_for(capture: Capture, size: str) -> str:
+    """`physical`, but at the size `paper` the published recipe for the capture's kind of sensor."""
+    if size != "paper":
+        return "physical"
+    coloured = capture.events is not None and capture.events.coloured
+    return "cdavis_full" if coloured else "blender_full"
+
+
 @dataclass(frozen=True)
 class EvDeblurNeRF:
     """Blurry frames and events to a sharp static scene. Defaults: the paper's synthetic recipe."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        variants={
+            "physical": physical,
+            "blender_full": blender_full,
+            "blender_minus": blender_minus,
+            "cdavis_full": cdavis_full,
+        },
+        sizes={"draft": draft, "standard": standard, "paper": published},
+        variant_for=variant_for,
+    )
 
     steps: int = 30_000
     """Length of the schedule."""

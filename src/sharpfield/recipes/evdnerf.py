@@ -22,6 +22,7 @@ from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
 from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
@@ -96,11 +97,44 @@ class Curriculum:
         )
 
 
+def lego(recipe: "EvDNeRF") -> "EvDNeRF":
+    """The paper's recipe for low contrast: a dead zone, and a tenth of the rate."""
+    return replace(recipe, rate=recipe.rate / 10, dead_zone=True)
+
+
+def real(recipe: "EvDNeRF") -> "EvDNeRF":
+    """The paper's recipe for real data: two networks, no compression."""
+    curriculum = replace(recipe.curriculum, windows=(99,), stages=(0,), crop=5_000, times=30_000)
+    scene = replace(recipe.scene, networks=2)
+    return replace(recipe, steps=50_000, gamma=0.0, curriculum=curriculum, scene=scene)
+
+
+def draft(recipe: "EvDNeRF") -> "EvDNeRF":
+    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
+    scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
+    return replace(recipe.lasting(2000), rate=10 * recipe.rate, pairs=128, scene=scene)
+
+
+def standard(recipe: "EvDNeRF") -> "EvDNeRF":
+    """Half as wide and a tenth as long; for a GPU."""
+    scene = replace(recipe.scene, width=128, samples=(48, 64))
+    return replace(recipe.lasting(20_000), rate=5 * recipe.rate, scene=scene)
+
+
+def published(recipe: "EvDNeRF") -> "EvDNeRF":
+    """The published networks and length."""
+    return recipe
+
+
 @dataclass(frozen=True)
 class EvDNeRF:
     """Events of several still views to a moving scene. Defaults: the paper's simulated scenes."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        variants={"lego": lego, "real": real},
+        sizes={"draft": draft, "standard": standard, "paper": published},
+    )
 
     steps: int = 200_000
     """Length of the schedule."""

@@ -22,12 +22,14 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import luma, tone_of
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds, thresholds_of
+from sharpfield.fields.space_time import SpaceTimeSize
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes import evdnerf
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.voxel_scene import MovingOptions, MovingScene
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table
@@ -65,11 +67,26 @@ class WindowOptions:
     """Light added before the logarithm, where the capture does not note it."""
 
 
+def draft(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
+    """Minutes on two CPU cores."""
+    windows = replace(recipe.windows, spans=64, counted=320)
+    return replace(recipe.lasting(2000), windows=windows)
+
+
+def standard(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
+    """Finer in space and time; an hour on a CPU."""
+    size = SpaceTimeSize(still=96, moving=80, moments=48)
+    scene = replace(recipe.scene, size=size, steps=96)
+    windows = replace(recipe.windows, spans=256, counted=1280)
+    return replace(recipe.lasting(12_000), scene=scene, windows=windows)
+
+
 @dataclass(frozen=True)
 class EvDNeRFPhysical:
     """Events of a moving scene, counted exactly, and frames if there are any."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(sizes={"draft": draft, "standard": standard})
 
     steps: int = 6000
     """Length of the schedule."""

@@ -5,7 +5,7 @@ say what is where, the frames nearby what it looks like. Rendered patches are bl
 ones before they are compared, and sharp frames count more.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -23,6 +23,8 @@ from sharpfield.formation.patch_kernel import (
     motion_kernels,
 )
 from sharpfield.metrics.frame_weights import Judge, frame_weights
+from sharpfield.recipes import point_nerf
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.points.hybrid_checkpoint import load_released
 from sharpfield.recipes.points.images import ImageBranch, SourceOptions
@@ -87,11 +89,64 @@ class BlurOptions:
     """What is added up: stored values, as published, or light."""
 
 
+def h_only(recipe: "Hybrid") -> "Hybrid":
+    """H of the paper: single pixels, no blur, all frames alike."""
+    drawn = replace(recipe.drawn, patches=3136, side=1)
+    return replace(recipe, drawn=drawn, blur=replace(recipe.blur, kind="none"), quality="even")
+
+
+def rooms(recipe: "Hybrid") -> "Hybrid":
+    """Full as the paper has it for simulated rooms: 12 kernels, patches up to 6 pixels apart."""
+    blur = replace(recipe.blur, strokes="through")
+    return replace(recipe, blur=blur, drawn=replace(recipe.drawn, apart=(1, 6)))
+
+
+def learned(recipe: "Hybrid") -> "Hybrid":
+    """Full with a kernel learned for each patch."""
+    return replace(recipe, blur=replace(recipe.blur, kind="learned"))
+
+
+def no_images(recipe: "Hybrid") -> "Hybrid":
+    """The control of the paper: points alone."""
+    return replace(recipe, sources=replace(recipe.sources, count=0))
+
+
+def draft(recipe: "Hybrid") -> "Hybrid":
+    """Minutes on two CPU cores; sources by pose, what hides them by depth, light adds up."""
+    return replace(_by_pose_and_depth(point_nerf.draft(recipe)), merge=32)
+
+
+def standard(recipe: "Hybrid") -> "Hybrid":
+    """Minutes on a GPU, hours on a CPU."""
+    return _by_pose_and_depth(point_nerf.standard(recipe))
+
+
+def _by_pose_and_depth(recipe: "Hybrid") -> "Hybrid":
+    """Images chosen and seen through by what poses and depth tell."""
+    sources = replace(
+        recipe.sources,
+        choose="pose",
+        fetch="bilinear",
+        visibility="depth",
+        trust=1.0,
+        prefer=1.0,
+    )
+    judged = recipe.quality if recipe.quality == "even" else "auto"
+    return replace(
+        recipe, sources=sources, quality=judged, blur=replace(recipe.blur, light="linear")
+    )
+
+
 @dataclass(frozen=True)
 class Hybrid(PointNeRF):
     """Neural points and features of nearby images to a scene, from blurry video with depth."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        variants={"h-only": h_only, "rooms": rooms, "learned": learned, "no-images": no_images},
+        sizes={"draft": draft, "standard": standard, "paper": point_nerf.published},
+        renamed={"no-pictures": "no-images"},
+    )
 
     drawn: DrawOptions = field(default_factory=lambda: DrawOptions(patches=49, side=8))
     sources: SourceOptions = field(default_factory=SourceOptions)

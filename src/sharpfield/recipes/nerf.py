@@ -17,8 +17,9 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.core.tone import tone_of
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.volume.frame_terms import FrameOptions, KernelTerm, Terms
-from sharpfield.recipes.volume.scene import Volume, VolumeOptions
+from sharpfield.recipes.volume.scene import DRAFT, GRID_RATE, STANDARD, Volume, VolumeOptions
 
 PAPER = Paper(
     key="mildenhall2020nerf",
@@ -38,11 +39,30 @@ PAPER = Paper(
 )
 
 
+def draft(recipe: "NeRF") -> "NeRF":
+    """A dense grid instead of large networks; minutes on two CPU cores."""
+    return NeRF(steps=2000, rate=GRID_RATE, decay=1000, pixels=1024, volume=VolumeOptions(**DRAFT))
+
+
+def standard(recipe: "NeRF") -> "NeRF":
+    """Planes; minutes on a GPU."""
+    volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **STANDARD)
+    return NeRF(steps=10_000, rate=5e-3, decay=3333, smooth=0.02, volume=volume)
+
+
+def published(recipe: "NeRF") -> "NeRF":
+    """The published networks and length."""
+    return NeRF()
+
+
 @dataclass(frozen=True)
 class NeRF:
     """Frames to a scene, blur and all."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        sizes={"draft": draft, "standard": standard, "paper": published}
+    )
 
     steps: int = 200_000
     """Length of the schedule."""

@@ -11,6 +11,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
 from sharpfield.fields.points.networks import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.model import DrawOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions, PointScene
@@ -41,11 +42,65 @@ PAPER = Paper(
 )
 
 
+P = TypeVar("P", bound="PointNeRF")
+
+
+def draft(recipe: P) -> P:
+    """Minutes on two CPU cores: small networks on averaged neighbours, and first colours."""
+    recipe = quick(recipe, points=50_000, width=64, feature=64, pixels=1024, asked=12)
+    return replace(recipe.lasting(2000), rate=2e-3, points_rate=5e-3, decay=0.05)
+
+
+def standard(recipe: P) -> P:
+    """Minutes on a GPU, hours on a CPU."""
+    recipe = quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, asked=16)
+    return replace(recipe.lasting(20_000), rate=1e-3, points_rate=4e-3, decay=0.05)
+
+
+def published(recipe: P) -> P:
+    """The published networks, points and length."""
+    return recipe
+
+
+def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, asked: int) -> P:
+    """What needs no weights of another data set to learn fast."""
+    whole = recipe.drawn.side**2
+    drawn = DrawOptions(
+        patches=max(pixels // whole, 1),
+        side=recipe.drawn.side,
+        apart=(1, 3),
+        frames=8,
+        border=0,
+    )
+    return replace(
+        recipe,
+        start_colours=True,
+        drawn=drawn,
+        cloud=CloudOptions(
+            budget=points, colours="fused", nearest=0.0, farthest=float("inf"), frames="train"
+        ),
+        sizes=PointSizes(
+            channels=16,
+            width=width,
+            feature=feature,
+            octaves=(0, 3, 2),
+            axes="world",
+            average="early",
+            unit=0.0,
+        ),
+        march=MarchOptions(voxel=0.0, steps=0, asked=asked, thickness=1.0, background=0.5),
+        growth=GrowthOptions(every=0.1, until=0.5, most=2 * points),
+    )
+
+
 @dataclass(frozen=True)
 class PointNeRF:
     """Neural points from depth to a scene, blur and all."""
 
     paper: ClassVar[Paper] = PAPER
+    presets: ClassVar[Presets] = Presets(
+        sizes={"draft": draft, "standard": standard, "paper": published}
+    )
 
     steps: int = 200_000
     """Length of the schedule."""

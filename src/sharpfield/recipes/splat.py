@@ -23,6 +23,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
 from sharpfield.initialisation.posed_images import sharp_light_images
+from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.hybrid import PAPER
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
@@ -111,11 +112,40 @@ OURS = Paper(
 )
 
 
+REFINED_KNOTS = 48
+"""Knots of a refined trajectory."""
+
+
+def refine(recipe: "Splat") -> "Splat":
+    """Thresholds, poses and the clocks' offset are learned, too."""
+    unknowns = replace(recipe.unknowns, thresholds="signs", knots=REFINED_KNOTS, offset=True)
+    looks = recipe.looks
+    if looks.sharp > 0:
+        # Sharp images are made with the thresholds that are believed, and would confirm them.
+        looks = replace(looks, early=0.3, sharp=0.01, windows=0.01, longest_us=200_000)
+    return replace(recipe, looks=looks, unknowns=unknowns)
+
+
+def draft(recipe: "Splat") -> "Splat":
+    """Minutes on two CPU cores."""
+    return recipe.lasting(6000)
+
+
+def standard(recipe: "Splat") -> "Splat":
+    """Minutes on a GPU: more Gaussians, of SH degree 3, and more views of each exposure."""
+    return replace(
+        recipe.lasting(15_000),
+        gaussians=replace(recipe.gaussians, degree=3, density=1.5),
+        looks=replace(recipe.looks, instants=max(recipe.looks.instants, 5)),
+    )
+
+
 @dataclass(frozen=True)
 class Splat:
     """Gaussians from frames taken as they are. The baseline of the fast recipes."""
 
     paper: ClassVar[Paper] = KERBL
+    presets: ClassVar[Presets] = Presets({"refine": refine}, {"draft": draft, "standard": standard})
 
     steps: int = 15_000
     """Length of the schedule."""

@@ -1,7 +1,7 @@
 """The sharp scene of the volumetric recipes: a capture in its own space, a field, a renderer."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -62,6 +62,22 @@ class VolumeOptions:
     """In evaluation, nothing is seen up to this ray parameter (0...1); hides floaters."""
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
     """What the heads compute in; auto takes bfloat16 where the CPU has it."""
+
+
+GRID_RATE = 0.2
+"""Learning rate of a dense grid, whose cells are density and colour themselves."""
+DRAFT: dict[str, Any] = {"kind": "voxels", "voxels": (0, 0), "samples": (96, 0), "noise": 0.0}
+"""Changes to `VolumeOptions` for minutes on a CPU."""
+STANDARD: dict[str, Any] = {
+    "voxels": (160**3, 320**3),
+    "channels": (32, 16, 16),
+    "coarse": (64, 15, 64),
+    "fine": (128, 64, 128),
+    "octaves": (6, 4),
+    "samples": (48, 48),
+    "precision": "auto",
+}
+"""Changes to `VolumeOptions` for minutes on a GPU."""
 
 
 def soft(raw: torch.Tensor) -> torch.Tensor:
