@@ -157,7 +157,7 @@ def test_what_is_wrong_is_said(tmp_path, text, message):
 def test_what_is_not_there_is_said(tmp_path):
     with pytest.raises(CaptureError, match="calibration not found"):
         read_calibration(tmp_path / "none.yaml")
-    with pytest.raises(CaptureError, match="size of the image"):
+    with pytest.raises(CaptureError, match="image size"):
         only(written(tmp_path / "calib.txt", "1 1 0 0 0 0 0 0 0"))
     (tmp_path / "c.xml").write_bytes(b"<?xml version='1.0'?><opencv_storage><a>")
     with pytest.raises(CaptureError):
