@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.fields.space_time import SpaceTimeSize
+from sharpfield.fields.voxels import VoxelSizes
 from sharpfield.geometry.normalise import centred
 from sharpfield.initialisation.visual_hull import hull, silhouettes
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
@@ -22,7 +22,7 @@ SMALL = EvDNeRFPhysical(
     decay=40,
     pixels=32,
     frames=20.0,
-    scene=MovingOptions(size=SpaceTimeSize(still=12, moving=8, moments=4), steps=16, empty=0.1),
+    scene=MovingOptions(size=VoxelSizes(static=12, moving=8, moments=4), steps=16, empty=0.1),
     windows=WindowOptions(spans=32, counted=32),
 )
 

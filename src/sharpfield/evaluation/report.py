@@ -18,6 +18,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
 from sharpfield.core.paper import Paper
 from sharpfield.core.seed import evenly_spread
+from sharpfield.core.tone import luma
 from sharpfield.evaluation.event_videos import events_section
 from sharpfield.evaluation.views import SHARP, TRUTH, Reference, held_out, trained_on
 from sharpfield.report import page

@@ -22,7 +22,7 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import luma, tone_of
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds, thresholds_of
-from sharpfield.fields.space_time import SpaceTimeSize
+from sharpfield.fields.voxels import VoxelSizes
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.formation.shutter import Shutter
@@ -75,7 +75,7 @@ def draft(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
 
 def standard(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
     """Finer in space and time; an hour on a CPU."""
-    size = SpaceTimeSize(still=96, moving=80, moments=48)
+    size = VoxelSizes(static=96, moving=80, moments=48)
     scene = replace(recipe.scene, size=size, steps=96)
     windows = replace(recipe.windows, spans=256, counted=1280)
     return replace(recipe.lasting(12_000), scene=scene, windows=windows)

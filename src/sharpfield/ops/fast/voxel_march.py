@@ -1,8 +1,8 @@
 # pyright: basic
-"""Marching through voxel grids on the CPU: one pass forwards, and one back along what it met.
+"""Volume rendering of voxel grids on the CPU: one pass forwards, one back over the same samples.
 
-Rays are cut into PARTS shares with a gradient grid each, which are added at the end. A ray ends
-once next to nothing gets through.
+The rays are split into PARTS, each with a gradient grid of its own; these are added at the end. A
+ray ends once its transmittance is below MIN_TRANSMITTANCE.
 """
 
 from collections.abc import Sequence
@@ -10,39 +10,60 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast._kernel import kernel, memory, share, spread
-from sharpfield.ops.fast._trace import (
-    DARK,
+from sharpfield.ops.fast._ray_samples import (
+    MIN_TRANSMITTANCE,
     PARTS,
-    gather,
-    merge,
-    note,
-    note_end,
-    room_for_traces,
-    slopes,
+    add_parts,
+    composite,
+    record,
+    record_opaque_end,
+    sample_buffers,
+    sample_gradient,
 )
-from sharpfield.ops.fast._voxels import add, inside, look, new_spot, point_on
-from sharpfield.ops.voxel_march import march
+from sharpfield.ops.fast._voxels import (
+    add_to_moving,
+    add_to_static,
+    inside,
+    lookup_buffers,
+    point_on,
+    read_moving,
+    read_static,
+    time_gradient,
+    zero,
+)
+from sharpfield.ops.voxel_march import march_voxels
 
 
-@march.accelerate("cpu", needs="numba")
+@march_voxels.accelerate("cpu", needs="numba")
 def _(
     origin: Float[Tensor, "b 3"],
     direction: Float[Tensor, "b 3"],
-    place: Float[Tensor, "b s"],
-    grids: Sequence[Float[Tensor, "_ _ _ 4"]],
+    depths: Float[Tensor, "b s"],
+    static: Sequence[Float[Tensor, "_ _ _ 4"]],
+    moving: Sequence[Float[Tensor, "_ 4"]] = (),
+    rows: Sequence[Int32[Tensor, "_ _ _ _"]] = (),
+    time: Float[Tensor, "b"] | None = None,
     *,
     opaque_end: bool = True,
 ) -> Float[Tensor, "b 5"]:
-    moving = any(x.requires_grad for x in (origin, direction, place))
-    if moving or any(grid.dtype != torch.float32 for grid in grids):
-        return march.reference(origin, direction, place, grids, opaque_end=opaque_end)
-    rays = [x.contiguous() for x in (origin, direction, place)]
-    return _March.apply(*rays, opaque_end, *[grid.contiguous() for grid in grids])
+    grids = (*static, *moving)
+    if (
+        any(x.requires_grad for x in (origin, direction, depths))
+        or any(grid.dtype != torch.float32 for grid in grids)
+        or (moving and time is None)
+    ):
+        given = (origin, direction, depths, static, moving, rows, time)
+        return march_voxels.reference(*given, opaque_end=opaque_end)
+    if time is None:
+        time = origin.new_zeros(0)  # no kernel reads it
+    rays = [x.contiguous() for x in (origin, direction, depths, time)]
+    cells = tuple(memory(x.contiguous()) for x in rows)
+    return _March.apply(*rays, cells, opaque_end, *[grid.contiguous() for grid in grids])
 
 
 class _March(torch.autograd.Function):
@@ -51,86 +72,108 @@ class _March(torch.autograd.Function):
         ctx: Any,
         origin: Tensor,
         direction: Tensor,
-        place: Tensor,
+        depths: Tensor,
+        time: Tensor,
+        rows: tuple[np.ndarray, ...],
         opaque_end: bool,
         *grids: Tensor,
     ) -> Tensor:
-        ctx.save_for_backward(origin, direction, place, *grids)
+        ctx.save_for_backward(origin, direction, depths, time, *grids)
+        ctx.rows = rows
         out = torch.empty(len(origin), 5)
-        rays = (memory(origin), memory(direction), memory(place))
-        cells = tuple(memory(grid) for grid in grids)
+        rays = tuple(memory(x) for x in (origin, direction, depths, time))
         learning = any(ctx.needs_input_grad)
-        met = room_for_traces(*place.shape, learning=learning)
-        spread(_forward, cells, rays, (opaque_end, learning), met, memory(out))
-        ctx.met = met if learning else None
+        samples = sample_buffers(*depths.shape, learning=learning)
+        field = (*_split([memory(grid) for grid in grids], len(rows)), rows or None)
+        spread(_forward, field, rays, (opaque_end, learning), samples, memory(out))
+        ctx.samples = samples if learning else None
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        origin, direction, place, *grids = ctx.saved_tensors
+        rays, grids, rows = ctx.saved_tensors[:4], ctx.saved_tensors[4:], ctx.rows
         # Numpy asks for huge pages, which are several times faster to fill.
         sums = [np.empty((PARTS, *grid.shape), np.float32) for grid in grids]
-        parts = tuple(tuple(total[k] for total in sums) for k in range(PARTS))
-        rays = (memory(origin), memory(direction), memory(place))
-        wanted = memory(gradients[0].contiguous())
-        spread(_backward, rays, ctx.met, wanted, parts)
+        parts = tuple(_split([total[k] for total in sums], len(rows)) for k in range(PARTS))
+        grad_out = memory(gradients[0].contiguous())
+        # Of no ray where nobody asks for the gradient of time.
+        grad_time = torch.zeros(len(rays[3]) if ctx.needs_input_grad[3] else 0)
+        field = (*_split([memory(grid) for grid in grids], len(rows)), rows or None)
+        given = tuple(memory(x) for x in rays)
+        spread(_backward, field, given, (ctx.samples, memory(grad_time)), grad_out, parts)
         for total in sums:
-            spread(merge, total.reshape(PARTS, -1))
-        return None, None, None, None, *[torch.from_numpy(total[0]) for total in sums]
+            spread(add_parts, total.reshape(PARTS, -1))
+        found = grad_time if ctx.needs_input_grad[3] else None
+        return None, None, None, found, None, None, *[torch.from_numpy(t[0]) for t in sums]
+
+
+def _split(grids: Sequence[np.ndarray], moving: int) -> tuple[Any, Any]:
+    """Static grids, and the values of moving ones: None without any, so that no code reads them."""
+    static = len(grids) - moving
+    return tuple(grids[:static]), tuple(grids[static:]) or None
 
 
 @kernel
-def _walk(grids, rays, ray, opaque_end, trace, spot):
-    """Fill the trace of one ray; returns how many samples it has."""
-    place, found = rays[2][ray], spot[0]
-    clear, kept = 1.0, 0
-    for s in range(len(place)):
-        point = point_on(rays, ray, place[s])
-        last = opaque_end and s == len(place) - 1
+def _sample(field, rays, ray, opaque_end, samples, buffers):
+    """Record the samples of one ray; returns how many there are."""
+    static, moving, rows = field
+    depths, values = rays[2][ray], buffers[0]
+    transmittance, count = 1.0, 0
+    for s in range(len(depths)):
+        point = point_on(rays, ray, depths[s])
+        last = opaque_end and s == len(depths) - 1
         within = inside(point)
         if not (within or last):
+            if count and not opaque_end:
+                break  # the box is convex: the ray has left it
             continue
-        found[:] = 0.0
+        values[:] = 0.0
         if within:
-            look(grids, point, spot)
+            read_static(static, point, buffers)
+            read_moving(moving, rows, point, rays[3], ray, buffers)
         if last:
-            note_end(trace[kept], s, found, clear)
+            record_opaque_end(samples[count], s, values, transmittance)
         else:
-            clear = note(trace[kept], s, found, clear)
-        kept += 1
-        if clear < DARK:
+            transmittance = record(samples[count], s, values, transmittance)
+        count += 1
+        if transmittance < MIN_TRANSMITTANCE:
             break
-    return kept
+    return count
 
 
 @kernel
-def _forward(worker, workers, grids, rays, mode, met, out):
-    """Colour, depth and opacity of a share of the rays, and the samples that they met."""
+def _forward(worker, workers, field, rays, mode, recorded, out):
+    """Colour, depth and opacity of a share of the rays, and the samples on them."""
     opaque_end, learning = mode
-    traces, counts = met
-    spot = new_spot()
+    samples, counts = recorded
+    buffers = lookup_buffers()
     for ray in range(*share(worker, workers, len(out))):
-        trace = traces[ray if learning else worker]
-        counts[ray] = _walk(grids, rays, ray, opaque_end, trace, spot)
-        gather(trace, counts[ray], rays[2][ray], out[ray])
+        own = samples[ray if learning else worker]
+        counts[ray] = _sample(field, rays, ray, opaque_end, own, buffers)
+        composite(own, counts[ray], rays[2][ray], out[ray])
 
 
 @kernel
-def _backward(worker, workers, rays, met, wanted, parts):
-    """Gradients of the grids; part after part, each into its own sum."""
-    place = rays[2]
-    traces, counts = met
-    spot = new_spot()
-    for part in range(worker, PARTS, workers):
-        for level in range(len(parts[part])):
-            parts[part][level][:] = 0.0
-        for ray in range(*share(part, PARTS, len(wanted))):
+def _backward(worker, workers, field, rays, lists, grad_out, parts):
+    """Gradients of the grids; part after part, each into its own sum; those of times, if asked."""
+    _, moving, rows = field
+    depths, time = rays[2], rays[3]
+    (samples, counts), grad_time = lists
+    buffers = lookup_buffers()
+    for part in range(worker, len(parts), workers):
+        grad_static, grad_moving = parts[part]
+        zero(grad_static)
+        zero(grad_moving)
+        for ray in range(*share(part, len(parts), len(grad_out))):
             behind = 0.0
             for k in range(counts[ray] - 1, -1, -1):
-                row = traces[ray, k]
-                z = place[ray, int(row[0])]
-                behind = slopes(row, z, wanted[ray], behind, spot[0])
-                point = point_on(rays, ray, z)
-                if inside(point):  # the end may lie behind the box
-                    add(parts[part], point, spot)
+                sample = samples[ray, k]
+                depth = depths[ray, int(sample[0])]
+                behind = sample_gradient(sample, depth, grad_out[ray], behind, buffers[0])
+                point = point_on(rays, ray, depth)
+                if inside(point):  # an opaque end may lie behind the box
+                    add_to_static(grad_static, point, buffers)
+                    add_to_moving(grad_moving, rows, point, time, ray, buffers)
+                    if len(grad_time) and -1.0 <= time[ray] <= 1.0:
+                        grad_time[ray] += time_gradient(moving, rows, point, time, ray, buffers)

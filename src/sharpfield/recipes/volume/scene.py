@@ -15,14 +15,14 @@ from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.plane_grid import HeadSize, PlaneField
-from sharpfield.fields.voxels import VoxelGrid
+from sharpfield.fields.voxels import VoxelField, shapes_in
 from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
 from sharpfield.losses.regularizers import smoothness
 from sharpfield.ops.total_variation import total_variation
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.gather import Compositing
-from sharpfield.rendering.march import EvenSteps
+from sharpfield.rendering.voxels import EvenSteps
 
 MOST_CELLS = 4_000_000
 """Cells of a dense grid that sizes itself; each costs 64 bytes with its gradient and moments."""
@@ -106,7 +106,7 @@ class Volume(nn.Module):
         self.space = _space(options, self.capture, poses)
         box = self.space.box(_seen_from(self.capture, poses))
         self.field = _field(options, box, self.capture.camera, seed)
-        if isinstance(self.field, VoxelGrid):
+        if isinstance(self.field, VoxelField):
             self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
             self.view = replace(self.train_view, clear_before=options.clear_before)
             return
@@ -137,16 +137,16 @@ class Volume(nn.Module):
 
     def smoothness(self) -> Tensor:
         """Total variation of the grids; zero without any."""
-        if isinstance(self.field, VoxelGrid):
+        if isinstance(self.field, VoxelField):
             # Plenoxels (CVPR 2022) takes the root of the squares instead, at sampled cells.
-            return total_variation(self.field.cells()[0])
+            return total_variation(self.field.static[0])
         planes, lines = self.field.planes(), self.field.lines()
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
     def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
         """Parameters of the networks and of the grids."""
-        if isinstance(self.field, VoxelGrid):
-            grids: tuple[nn.Parameter, ...] = tuple(self.field.cells())
+        if isinstance(self.field, VoxelField):
+            grids: tuple[nn.Parameter, ...] = tuple(self.field.static)
         else:
             grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}
@@ -162,10 +162,11 @@ def stages(light: Radiance) -> list[Radiance]:
 
 def _field(
     options: VolumeOptions, box: Float[Tensor, "2 3"], camera: Camera, seed: int
-) -> PlaneField | MLPField | VoxelGrid:
+) -> PlaneField | MLPField | VoxelField:
     if options.kind == "voxels":
         pixels = camera.width * camera.height
-        return VoxelGrid(box, options.voxels[1] or min(pixels * sum(options.samples), MOST_CELLS))
+        voxels = options.voxels[1] or min(pixels * sum(options.samples), MOST_CELLS)
+        return VoxelField(shapes_in(box, voxels), box=box)
     made = generator(seed, 0, "field")
     if options.kind == "mlp":
         return MLPField(generator=made)

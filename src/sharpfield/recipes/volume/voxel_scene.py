@@ -4,7 +4,6 @@ Its terms ask for what events leave open: what moves is smooth, in space and in 
 """
 
 from dataclasses import dataclass, field
-from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -15,11 +14,11 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.events.index import EventIndex
-from sharpfield.fields.space_time import SpaceTimeSize, SpaceTimeVoxels, moving_shapes
+from sharpfield.fields.voxels import VoxelField, VoxelSizes, moving_shapes, static_shapes
 from sharpfield.geometry.normalise import centred
 from sharpfield.initialisation.visual_hull import hull
-from sharpfield.ops.voxel_march import THIN
-from sharpfield.rendering.march_through_time import SpaceTime, ThroughBox
+from sharpfield.ops.voxel_march import DENSITY_SHIFT
+from sharpfield.rendering.voxels import BoxSteps
 
 FOG_POINTS = 2048
 """Points that are asked for fog in each step."""
@@ -32,7 +31,7 @@ DENSE = 10.0
 class MovingOptions:
     """The field, and how rays sample it."""
 
-    size: SpaceTimeSize = field(default_factory=SpaceTimeSize)
+    size: VoxelSizes = field(default_factory=VoxelSizes)
     steps: int = 64
     """Of a ray from side to side of the box."""
     clear: float = -3.0
@@ -66,20 +65,24 @@ class MovingScene(nn.Module):
         self.options, self.seed = options, seed
         self.capture, self.change = centred(capture)
         self.path = self.capture.trajectory
-        hulls = None
+        hulls, shapes = None, moving_shapes(options.size)
         if options.hull and index is not None:
-            shapes = moving_shapes(options.size)
             hulls = [hull(self.capture, index, cells, moments) for moments, cells in shapes]
-        where = [one.possible for one in hulls if one is not None] if hulls else None
-        self.field = SpaceTimeVoxels(options.size, where or None, options.clear)
+        occupied = [one.possible for one in hulls or [] if one is not None]
+        self.field = VoxelField(
+            static_shapes(options.size),
+            occupied or [torch.ones(moments, n, n, n).bool() for moments, n in shapes],
+            raw_density=options.clear,
+            background=True,
+        )
         if hulls and hulls[0] is not None:
             self.field.fill(hulls[0].solid, options.solid)
-        self.view = ThroughBox(cast(SpaceTime, self.field), step=2 / options.steps)
+        self.view = BoxSteps(self.field, step=2 / options.steps)
 
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
-        return self.field.behind.device
+        return self.field.static[0].device
 
     def sharp(self, rays: Rays, step: int, stream: str) -> Radiance:
         """Light along rays while training: jittered by seed, step and stream."""
@@ -109,7 +112,10 @@ class MovingScene(nn.Module):
         points = 2 * torch.rand(FOG_POINTS, 3, generator=random) - 1
         time = float(torch.rand((), generator=random))
         raw = self.field.raw_density(points.to(self.device), time)
-        return self.options.empty * torch.log1p(DENSE * functional.softplus(raw + THIN)).mean()
+        return (
+            self.options.empty
+            * torch.log1p(DENSE * functional.softplus(raw + DENSITY_SHIFT)).mean()
+        )
 
     def groups(self, rate: Schedule) -> list[Group]:
         """Voxels and background."""

@@ -5,12 +5,16 @@ import torch
 from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Rays
 from sharpfield.core.seed import generator
-from sharpfield.fields.voxels import VoxelGrid
+from sharpfield.fields.voxels import VoxelField, shapes_in
 from sharpfield.geometry.space import Frustum, Metric
-from sharpfield.rendering.march import EvenSteps
+from sharpfield.rendering.voxels import EvenSteps
 
 CAMERA = Camera(16, 12, 15.0, 15.0, 8.0, 6.0)
 BOX = torch.tensor([[-1.1, -1.1, 1.0], [1.1, 1.1, 3.0]])
+
+
+def field(box: torch.Tensor, voxels: int) -> VoxelField:
+    return VoxelField(shapes_in(box, voxels), box=box)
 
 
 def forward(count: int) -> Rays:
@@ -23,20 +27,20 @@ def forward(count: int) -> Rays:
 
 def test_an_empty_frustum_is_closed_by_its_end() -> None:
     box = Frustum(CAMERA).box(torch.eye(3, 4)[None])
-    view = EvenSteps(VoxelGrid(box, 1000), Frustum(CAMERA), 16)
+    view = EvenSteps(field(box, 1000), Frustum(CAMERA), 16)
     seen = view(forward(5))
     assert torch.allclose(seen.opacity, torch.ones(5), atol=1e-4)
     assert torch.allclose(seen.rgb, torch.full((5, 3), 0.5), atol=1e-4)
 
 
 def test_a_wall_is_seen_where_it_stands_in_its_colour() -> None:
-    grid = VoxelGrid(BOX, 8000)
+    grid = field(BOX, 8000)
     with torch.no_grad():
-        grid.grids[0][..., 0] = -20.0
-        middle = grid.grids[0].shape[0] // 2
-        grid.grids[0][middle:, :, :, 0] = 20.0
-        grid.grids[0][..., 1] = 3.0
-        grid.grids[0][..., 2:] = -3.0
+        grid.static[0][..., 0] = -20.0
+        middle = grid.static[0].shape[0] // 2
+        grid.static[0][middle:, :, :, 0] = 20.0
+        grid.static[0][..., 1] = 3.0
+        grid.static[0][..., 2:] = -3.0
     seen = EvenSteps(grid, Metric(CAMERA, 1.0, 3.0), 128)(forward(4))
     assert torch.allclose(seen.opacity, torch.ones(4), atol=1e-4)
     assert torch.allclose(seen.depth, torch.full((4,), 2.0), atol=0.1)
@@ -45,7 +49,7 @@ def test_a_wall_is_seen_where_it_stands_in_its_colour() -> None:
 
 
 def test_nothing_is_seen_beside_the_box() -> None:
-    grid = VoxelGrid(BOX, 1000)
+    grid = field(BOX, 1000)
     rays = forward(3)
     aside = Rays(rays.origin + 10.0, rays.direction, rays.time, rays.weight)
     seen = EvenSteps(grid, Metric(CAMERA, 1.0, 3.0), 16)(aside)
@@ -53,8 +57,8 @@ def test_nothing_is_seen_beside_the_box() -> None:
 
 
 def test_jitter_comes_from_the_generator_alone() -> None:
-    grid = VoxelGrid(BOX, 1000)
-    torch.nn.init.normal_(grid.grids[0], generator=torch.Generator().manual_seed(0))
+    grid = field(BOX, 1000)
+    torch.nn.init.normal_(grid.static[0], generator=torch.Generator().manual_seed(0))
     view = EvenSteps(grid, Metric(CAMERA, 1.0, 3.0), 16)
     one, same, other = (view(forward(6), generator(0, step, "x")).rgb for step in (1, 1, 2))
     assert torch.equal(one, same)
@@ -64,7 +68,7 @@ def test_jitter_comes_from_the_generator_alone() -> None:
 
 def test_shape_and_weights_of_the_rays_are_kept() -> None:
     rays = forward(6).reshape(2, 3)
-    seen = EvenSteps(VoxelGrid(BOX, 1000), Metric(CAMERA, 1.0, 3.0), 8)(rays)
+    seen = EvenSteps(field(BOX, 1000), Metric(CAMERA, 1.0, 3.0), 8)(rays)
     assert seen.rgb.shape == (2, 3, 3)
     assert seen.weight is not None
     assert seen.coarse is None
