@@ -20,7 +20,7 @@ def recorded(tmp_path):
 
 def test_a_capture_of_two_recordings(recorded, capsys):
     out = recorded / "garden"
-    words = ("--per-second", 50, "--exposure", "0.5", "--clock", "same", "--to", 60)
+    words = ("--fps", 50, "--exposure", "0.5", "--clock", "same", "--to", 60)
     assert run("ingest", recorded / "events.h5", recorded / "seen", "--out", out, *words) == 0
     said = capsys.readouterr().out.replace("\n", " ")
     assert "3 frames and" in said and "left out:" in said
@@ -38,7 +38,7 @@ def test_a_capture_of_two_recordings(recorded, capsys):
     ("words", "message"),
     [
         (("--columns", "xytp"), "the option `columns` has no effect"),
-        (("--per-second", 5), "the option `per_second` has no effect"),
+        (("--fps", 5), "the option `fps` has no effect"),
         (("--layout", "evt9"), "unknown format"),
         (("--rectify",), "lenses are not known"),
         (("--bayer", "RGB"), "unknown colour filter"),

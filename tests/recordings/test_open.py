@@ -1,10 +1,13 @@
+from importlib.metadata import EntryPoint
+
 import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.plugins import PluginWarning
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import (
     FORMATS,
-    ReaderOptions,
     format_of,
     open_events,
     open_recording,
@@ -77,7 +80,8 @@ def test_the_name_of_a_file_is_not_believed(tmp_path):
 
 def test_every_format_says_what_it_takes():
     for name, known in FORMATS.items():
-        assert set(known.takes) <= set(vars(ReaderOptions())), name
+        assert known.name == name
+        assert set(known.options) <= set(vars(ReaderOptions())), name
         assert known.holds and known.marks, name
 
 
@@ -114,3 +118,30 @@ def test_what_does_not_belong_to_the_format(tmp_path):
     write_image(tmp_path / "p" / "0.png", np.zeros((HEIGHT, WIDTH, 1), np.uint8))
     with pytest.raises(CaptureError, match="nothing says when"):
         open_events(tmp_path / "p")
+
+
+# Formats of other packages
+
+
+def test_another_package_adds_a_format_and_a_broken_one_is_only_a_warning(tmp_path, monkeypatch):
+    (tmp_path / "their_camera.py").write_text(
+        "from sharpfield.recordings.format import Format, begins_with\n"
+        "from sharpfield.recordings.tables.text import open_text\n"
+        "FORMAT = Format('their-camera', open_text, 'events', '`#THEIRS`',"
+        " recognise=begins_with(b'#THEIRS'), options=('size', 'unit'))\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    entries = [
+        EntryPoint("their-camera", "their_camera:FORMAT", FORMATS.group),
+        EntryPoint("broken", "no_such_package:FORMAT", FORMATS.group),
+    ]
+    monkeypatch.setattr("sharpfield.core.plugins.entry_points", lambda group: entries)
+    path = tmp_path / "a.rec"
+    path.write_text("#THEIRS\n0.5 1 2 1\n")
+    with pytest.warns(PluginWarning, match="broken = no_such_package:FORMAT"):
+        assert format_of(path) == "their-camera"
+    assert open_recording(path, ReaderOptions(size=(4, 4))).load().t_us.tolist() == [500_000]
+    with pytest.raises(OptionError, match="the format their-camera has no option columns"):
+        open_recording(path, ReaderOptions(columns="txyp"))
+    write_events(tmp_path / "e.h5", random_events(5))
+    assert len(open_recording(tmp_path / "e.h5").load()) == 5

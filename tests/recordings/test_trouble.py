@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.recordings.open import FORMATS, ReaderOptions, open_recording
+from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.open import FORMATS, open_recording
 from sharpfield.recordings.recording import ReadLog, Recording
 from sharpfield.storage.images import write_image
 from tests.recordings import fuzz
@@ -97,7 +98,7 @@ def torn_video(folder: Path) -> Recording:
 def images(folder: Path) -> Recording:
     for i in range(3):
         write_image(folder / f"{i}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    return open_recording(folder, ReaderOptions(per_second=30.0))
+    return open_recording(folder, ReaderOptions(fps=30.0))
 
 
 MAKE: dict[str, Make] = {

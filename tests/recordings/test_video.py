@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.video import open_images, open_video
 from sharpfield.storage.images import write_image
 from tests.recordings import fuzz
@@ -46,7 +47,7 @@ def test_frames_have_the_times_of_the_video(tmp_path):
 
 
 def test_slow_motion_has_the_rate_it_was_taken_at(tmp_path):
-    recording = open_video(video(tmp_path / "v.mkv", [0, 40, 80]), per_second=1000.0)
+    recording = open_video(video(tmp_path / "v.mkv", [0, 40, 80]), ReaderOptions(fps=1000.0))
     assert [frame.close_us for frame in recording.frames()] == [0, 1000, 2000]
 
 
@@ -111,20 +112,28 @@ def test_starts_and_ends_in_two_files(tmp_path):
     with pytest.raises(CaptureError, match="in which unit") as caught:
         open_images(folder)
     assert "0.1223 s if us" in str(caught.value)
-    assert opens(open_images(folder, unit="us"))[0] == (1615008142416409, 1615008142520408)
+    assert opens(open_images(folder, ReaderOptions(frame_unit="us")))[0] == (
+        1615008142416409,
+        1615008142520408,
+    )
 
 
 def test_timestamps_in_arrays(tmp_path):
     folder = images(tmp_path / "images_1")
     start = np.arange(4) * 1000
     np.savez(folder / "timestamps.npz", timestamps_start=start, timestamps_end=start + 500)
-    assert opens(open_images(folder, unit="ns")) == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert opens(open_images(folder, ReaderOptions(frame_unit="ns"))) == [
+        (0, 1),
+        (1, 2),
+        (2, 3),
+        (3, 4),
+    ]
 
 
 def test_a_rate(tmp_path):
-    assert opens(open_images(images(tmp_path / "p"), per_second=30.0))[3][0] == 100_000
+    assert opens(open_images(images(tmp_path / "p"), ReaderOptions(fps=30.0)))[3][0] == 100_000
     with pytest.raises(OptionError, match="between 0 and a million"):
-        open_images(tmp_path / "p", per_second=0.0)
+        open_images(tmp_path / "p", ReaderOptions(fps=0.0))
 
 
 def test_what_is_missing_is_asked_for(tmp_path):
@@ -136,7 +145,7 @@ def test_what_is_missing_is_asked_for(tmp_path):
     with pytest.raises(CaptureError, match="several files may say when") as caught:
         open_images(folder)
     assert "timestamps_a.txt, timestamps_b.txt" in str(caught.value)
-    chosen = open_images(folder, times=folder / "timestamps_a.txt", unit="s")
+    chosen = open_images(folder, ReaderOptions(times=folder / "timestamps_a.txt", frame_unit="s"))
     assert opens(chosen)[1] == (2_000_000, 2_000_000)
 
 
@@ -144,13 +153,13 @@ def test_what_does_not_fit_is_refused(tmp_path):
     folder = images(tmp_path / "p")
     (folder / "timestamps.txt").write_text("1\n2\n3\n")
     with pytest.raises(CaptureError, match="one time for each image"):
-        open_images(folder, unit="us")
+        open_images(folder, ReaderOptions(frame_unit="us"))
     (folder / "timestamps.txt").write_text("1\n2\nsoon\n4\n")
     with pytest.raises(CaptureError, match="cannot read a time"):
-        open_images(folder, unit="us")
+        open_images(folder, ReaderOptions(frame_unit="us"))
     (tmp_path / "images.txt").write_text("0.1 ../../secret.png\n")
     with pytest.raises(CaptureError, match="lies outside the recording"):
         open_images(tmp_path)
     (tmp_path / "empty").mkdir()
     with pytest.raises(CaptureError, match="no images found"):
-        open_images(tmp_path / "empty", per_second=1.0)
+        open_images(tmp_path / "empty", ReaderOptions(fps=1.0))

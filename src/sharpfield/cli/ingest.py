@@ -1,4 +1,4 @@
-"""The command that makes a capture of what a camera has recorded."""
+"""`sharpfield ingest`: make a capture of camera recordings."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,11 +18,9 @@ from rich.progress import (
 )
 from tyro.conf import Positional
 
-from sharpfield.cli.arguments import End, Size, Start, parse_size, screen
+from sharpfield.cli.arguments import End, Start, parse_size, screen
 from sharpfield.core.errors import OptionError
 from sharpfield.core.progress import progress_on
-from sharpfield.preparation.ingest.ingest import Ingested, Tell
-from sharpfield.preparation.ingest.ingest import ingest as ingest_recordings
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import (
     AxisFixes,
@@ -33,109 +31,77 @@ from sharpfield.preparation.ingest.options import (
     Timing,
     fixed_axes,
 )
-from sharpfield.recordings.open import FORMATS, ReaderOptions, format_of, open_recording
+from sharpfield.preparation.ingest.pipeline import Ingested, Progress
+from sharpfield.preparation.ingest.pipeline import ingest as ingest_recordings
+from sharpfield.recordings.format import Format, ReaderOptions
+from sharpfield.recordings.open import format_named, format_of, open_recording
 from sharpfield.recordings.recording import Recording
 
 FRAMES_ONLY = ("video", "images")
 """Formats that hold no events."""
 
-NO_MISTAKES = AxisFixes()
+Size = Annotated[
+    tuple[int, int],
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="WxH",
+        instance_from_str=lambda words: parse_size(words[0]),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda size: [f"{size[0]}x{size[1]}"],
+    ),
+]
+NO_FIXES = AxisFixes()
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(ReaderOptions):
     """What the files do not say of themselves."""
 
-    layout: str | None = None
-    """Format of the file of events; by default it is recognised. See docs/ingest.md."""
-    unit: str | None = None
-    """Of the times of events: ns, us, ms or s."""
     size: Size | None = None
-    """Of the event sensor, in pixels."""
-    topic: str | None = None
-    """Which of several cameras, streams or topics."""
-    image_topic: str | None = None
-    """Which of several topics of images."""
-    columns: str | None = None
-    """What the columns of a table of events are: xytp or txyp."""
-    event_encoding: str | None = None
-    """Of Prophesee's RAW, where the header does not say: evt2, evt2.1, evt2.1-legacy or evt3."""
-    frame_unit: str | None = None
-    """Of the times of images."""
-    per_second: float | None = None
-    """Frames taken per second, where nothing says when they were, or the video is slow motion."""
-    times: Path | None = None
-    """The file that says when images were taken, where there are several."""
-    mistakes: Annotated[AxisFixes, tyro.conf.arg(name="")] = NO_MISTAKES
-    """Of the file, to be undone."""
+    """Resolution of the event sensor in pixels."""
+    layout: str | None = None
+    """Format of the event file; recognised by default. See docs/ingest.md."""
+    axis_fixes: Annotated[AxisFixes, tyro.conf.arg(name="")] = NO_FIXES
+    """Errors of the event file to correct."""
 
     def opened(self, path: Path) -> Recording:
-        """A recording, told those of the options that its format knows."""
-        name = self._format(path)
-        told = replace(
-            ReaderOptions(),
-            **{
-                option: value
-                for option, value in self._told(name).given().items()
-                if option in FORMATS[name].takes
-            },
-        )
-        if told.size is not None and self.mistakes.swap_xy:
-            told = replace(told, size=told.size[::-1])
-        return fixed_axes(open_recording(path, told, layout=name), self.mistakes)
+        """Open a recording with the options that its format uses, and correct its axes."""
+        known = self.format(path)
+        options = self.only(known.options)
+        if options.size is not None and self.axis_fixes.swap_xy:
+            options = replace(options, size=options.size[::-1])
+        return fixed_axes(open_recording(path, options, layout=known.name), self.axis_fixes)
 
     def expect_used(self, paths: tuple[Path, ...]) -> None:
-        """Refuse options that none of the formats knows: they would have no effect.
+        """Refuse options that none of the formats uses.
 
         Raises:
             OptionError: There is one.
         """
-        names = [self._format(path) for path in paths]
-        given = {option for name in names for option in self._told(name).given()}
-        used = {
-            option
-            for name in names
-            for option in self._told(name).given()
-            if option in FORMATS[name].takes
-        }
-        if useless := sorted(given - used):
+        formats = [self.format(path) for path in paths]
+        used = {option for known in formats for option in known.options}
+        if unused := sorted(self.given().keys() - used):
             raise OptionError(
-                f"the option `{useless[0]}` has no effect on these recordings",
-                got=" and ".join(names),
+                f"the option `{unused[0]}` has no effect on these recordings",
+                got=" and ".join(known.name for known in formats),
                 do="leave it out",
             )
 
-    def _format(self, path: Path) -> str:
-        """The name of a file's format; `layout` is that of events."""
-        name = format_of(path) if self.layout is None else self.layout
-        if self.layout is not None and path.is_dir() and format_of(path) in FRAMES_ONLY:
-            name = format_of(path)
-        if name not in FORMATS:
-            raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
-        return name
-
-    def _told(self, name: str) -> ReaderOptions:
-        """What is told of a file of some format."""
-        return ReaderOptions(
-            unit=self.frame_unit if name in FRAMES_ONLY else self.unit,
-            size=None if self.size is None else parse_size(self.size),
-            topic=self.topic,
-            image_topic=self.image_topic,
-            columns=self.columns,
-            encoding=self.event_encoding,
-            per_second=self.per_second,
-            times=self.times,
-        )
+    def format(self, path: Path) -> Format:
+        """Format of a file; `layout` names that of the events."""
+        if self.layout is None or (path.is_dir() and format_of(path) in FRAMES_ONLY):
+            return format_named(format_of(path))
+        return format_named(self.layout)
 
 
 @dataclass(frozen=True)
 class Part:
-    """Which part to keep, in ms from the first event."""
+    """Time range to keep, in ms from the first event."""
 
     start_ms: Start = None
-    """Leave out what came before."""
+    """Leave out everything before."""
     end_ms: End = None
-    """Leave out what came after."""
+    """Leave out everything after."""
 
 
 SOURCE, PART = Source(), Part()
@@ -152,19 +118,19 @@ def ingest(
     cleaning: Cleaning = CLEANING,
     scene: Scene = SCENE,
 ) -> None:
-    """Make a capture of a camera's recording, or of two: events in one file, frames in another.
+    """Make a capture of one camera recording, or of two: events in one file, frames in another.
 
-    Interrupted, the same command goes on where it was.
+    After an interruption the same command continues where it was.
 
     Args:
         recordings: Files or folders that a camera or a program has written.
         out: Folder of the capture.
-        source: What the files do not say.
-        part: Which part to keep.
+        source: What the files do not say of themselves.
+        part: Time range to keep.
         timing: When frames were exposed.
-        optics: Lenses.
+        optics: Lens calibration.
         cleaning: Events to leave out.
-        scene: Poses, depth, colour.
+        scene: Poses, depth bounds, colour.
     """
     if len(recordings) not in (1, 2):
         raise OptionError("give one recording, or two", got=len(recordings))
@@ -173,32 +139,32 @@ def ingest(
     opened = tuple(source.opened(path) for path in recordings)
     for recording in opened:
         console.print(f"{recording.path} is {recording.layout}")
-    choices = IngestOptions(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
-    with _telling(console) as tell:
-        made = ingest_recordings(opened, out, choices, tell)
-    for line in _story(made, out):
+    options = IngestOptions(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
+    with _progress(console) as progress:
+        ingested = ingest_recordings(opened, out, options, progress)
+    for line in _summary_lines(ingested, out):
         console.print(line, soft_wrap=True)
 
 
-def _story(made: Ingested, out: Path) -> Iterator[str]:
-    """What became of the recording, line by line."""
-    lasts = (made.span_us[1] - made.span_us[0]) / 1e6
-    yield f"{made.frames:,} frames and {made.events:,} events over {lasts:.3f} s are in {out}"
-    for kind, count in made.left_out.items():
+def _summary_lines(ingested: Ingested, out: Path) -> Iterator[str]:
+    seconds = (ingested.span_us[1] - ingested.span_us[0]) / 1e6
+    counts = f"{ingested.frames:,} frames and {ingested.events:,} events"
+    yield f"{counts} over {seconds:.3f} s are in {out}"
+    for kind, count in ingested.left_out.items():
         yield f"  left out: {count:,} {kind}"
-    if made.hot_pixels:
-        yield f"  hot pixels: {made.hot_pixels:,}, listed in the note `hot_pixels`"
-    if made.clock:
-        yield f"  {made.clock}"
-    if made.unknown:
-        yield f"  not known yet: {', '.join(made.unknown)}"
-    if "poses" in made.unknown:
+    if ingested.hot_pixels:
+        yield f"  hot pixels: {ingested.hot_pixels:,}, listed in the note `hot_pixels`"
+    if ingested.clock:
+        yield f"  {ingested.clock}"
+    if ingested.unknown:
+        yield f"  not known yet: {', '.join(ingested.unknown)}"
+    if "poses" in ingested.unknown:
         yield f"next: sharpfield doctor {out}, then sharpfield poses {out} --out {out}-posed"
 
 
 @contextmanager
-def _telling(console: Console) -> Iterator[Tell]:
-    """Progress: a line for each thing that is being done."""
+def _progress(console: Console) -> Iterator[Progress]:
+    """A progress bar for each step."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -207,11 +173,11 @@ def _telling(console: Console) -> Iterator[Tell]:
         TimeRemainingColumn(),
     )
     tasks: dict[str, TaskID] = {}
-    with progress_on(console, *columns) as progress:
+    with progress_on(console, *columns) as bars:
 
-        def tell(doing: str, done: int, total: int | None) -> None:
-            if doing not in tasks:
-                tasks[doing] = progress.add_task(doing, total=total)
-            progress.update(tasks[doing], completed=done, total=total)
+        def update(step: str, done: int, total: int | None) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=total)
+            bars.update(tasks[step], completed=done, total=total)
 
-        yield tell
+        yield update

@@ -4,6 +4,7 @@ Compressed blocks of a file, unpacked without trusting what they say of themselv
 """
 
 import bz2
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,10 @@ from sharpfield.core.errors import CaptureError, need
 
 BLOCK = 2**21
 """Bytes read at once; small enough to stay in the CPU's cache until they are decoded."""
+
+
+ZIP = b"PK\x03\x04"
+"""What zip archives begin with."""
 
 
 def head(path: Path, count: int) -> bytes:
@@ -40,6 +45,17 @@ def blocks(path: Path, start: int = 0, count: int = BLOCK) -> Iterator[bytes]:
                 yield block
     except OSError as error:
         raise CaptureError("cannot read the recording", where=path, got=error) from None
+
+
+def zip_holds(path: Path, head: bytes, suffix: str) -> bool:
+    """Whether a file is a zip archive with a member whose name ends so."""
+    if not head.startswith(ZIP):
+        return False
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.endswith(suffix) for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError, NotImplementedError):
+        return False
 
 
 Bytes = bytes | memoryview

@@ -25,13 +25,14 @@ from av.error import FFmpegError
 from jaxtyping import Int64, Shaped
 
 from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.recording import Frame, ReadLog, Recording
 from sharpfield.storage.arrays import load_arrays
 from sharpfield.storage.event_columns import UNITS, known_unit, whole_us
 from sharpfield.storage.images import list_images, read_image
 
-FASTEST = 1e6
-"""Frames per second: times are whole us."""
+MAX_FPS = 1e6
+"""Times are whole us."""
 
 TOLD = re.compile(r"\b(ns|us|ms|s)\b|_(ns|us|ms|s)\b|\[(ns|us|ms|s)\]")
 """How a header names a unit."""
@@ -40,17 +41,17 @@ Times = tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]
 """When each exposure begins and ends, in us; the same where only one time is known."""
 
 
-def open_video(path: Path, *, per_second: float | None = None) -> Recording:
+def open_video(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a video.
 
     Args:
         path: Anything that FFmpeg decodes.
-        per_second: How many frames were taken per second, where that is not how it is shown.
+        options: `fps`, the rate of recording, where it differs from the rate of playback.
 
     Raises:
         CaptureError: It cannot be decoded, or holds no video.
     """
-    interval_us = None if per_second is None else 1e6 / _rate(per_second)
+    interval_us = None if options.fps is None else 1e6 / _checked_fps(options.fps)
     trouble = ReadLog()
     first = next(_decoded(path, interval_us, ReadLog()), None)
     if first is None:
@@ -64,26 +65,19 @@ def open_video(path: Path, *, per_second: float | None = None) -> Recording:
     )
 
 
-def open_images(
-    path: Path,
-    *,
-    unit: str | None = None,
-    per_second: float | None = None,
-    times: Path | None = None,
-) -> Recording:
+def open_images(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a folder of images.
 
     Args:
         path: The folder; or one that has the images in `images/`, and `images.txt`.
-        unit: Of the times (ns, us, ms, s), where the text does not say.
-        per_second: How many were taken per second, where no text says when.
-        times: The file that says when, where there are several.
+        options: `frame_unit` of the times, where their file does not give it; `fps`, where there is
+            no file of times; `times`, that file, where there are several candidates.
 
     Raises:
         CaptureError: There are no images, or nothing says when they were taken.
     """
     listed = path / "images.txt"
-    if times is None and per_second is None and listed.is_file():
+    if options.times is None and options.fps is None and listed.is_file():
         files, (opens, closes) = _rpg(listed)
     else:
         files = list_images(path) or (
@@ -91,7 +85,7 @@ def open_images(
         )
         if not files:
             raise CaptureError("no images found", where=path, do="put PNG or JPEG files there")
-        opens, closes = _times(files, unit, per_second, times)
+        opens, closes = _times(files, options)
     if len(opens) != len(files):
         raise CaptureError(
             "there must be one time for each image",
@@ -122,7 +116,7 @@ def _decoded(path: Path, interval_us: float | None, trouble: ReadLog) -> Iterato
                     raise CaptureError(
                         "the video does not say when its frames were taken",
                         where=f"{path}, frame {count}",
-                        do="give how many were taken per second",
+                        do="give the frames per second",
                     )
                 else:
                     t_us = round(frame.pts * frame.time_base * 1_000_000)
@@ -144,14 +138,13 @@ def _pixels(frame: av.VideoFrame) -> Shaped[np.ndarray, "h w *c"]:
     return frame.to_ndarray(format="rgb48le" if deep else "rgb24")
 
 
-def _times(
-    files: list[Path], unit: str | None, per_second: float | None, times: Path | None
-) -> Times:
-    if per_second is not None:
-        instants = np.rint(np.arange(len(files)) * (1e6 / _rate(per_second))).astype(np.int64)
+def _times(files: list[Path], options: ReaderOptions) -> Times:
+    if options.fps is not None:
+        interval_us = 1e6 / _checked_fps(options.fps)
+        instants = np.rint(np.arange(len(files)) * interval_us).astype(np.int64)
         return instants, instants
     folder = files[0].parent
-    sources = [(times,)] if times is not None else _candidates(folder)
+    sources = _candidates(folder) if options.times is None else [(options.times,)]
     if len(sources) != 1:
         raise CaptureError(
             "nothing says when the images were taken"
@@ -159,11 +152,11 @@ def _times(
             else "several files may say when the images were taken",
             where=folder,
             got=", ".join(path.name for source in sources for path in source),
-            do="give how many were taken per second, or the file of times"
+            do="give the frames per second, or the file of times"
             if not sources
             else "name one of them as the file of times",
         )
-    return _read_times(sources[0], unit)
+    return _read_times(sources[0], options.frame_unit)
 
 
 def _candidates(folder: Path) -> list[tuple[Path, ...]]:
@@ -249,12 +242,12 @@ def _rpg(listed: Path) -> tuple[list[Path], Times]:
             file = listed.parent / words[1].strip()
         except (ValueError, IndexError):
             raise CaptureError(
-                "a line must be a time and the path of a image",
+                "a line must be a time and the path of an image",
                 where=f"{listed}, line {number + 1}",
                 got=line[:60],
             ) from None
         if not file.resolve().is_relative_to(listed.parent.resolve()):
-            raise CaptureError("a image lies outside the recording", where=listed, got=file)
+            raise CaptureError("an image lies outside the recording", where=listed, got=file)
         files.append(file)
     if not files:
         raise CaptureError("no images are listed", where=listed)
@@ -273,7 +266,38 @@ def _no_unit(path: Path, column: Shaped[np.ndarray, "n"]) -> CaptureError:
     )
 
 
-def _rate(per_second: float) -> float:
-    if not 0 < per_second <= FASTEST:
-        raise OptionError("images per second must be between 0 and a million", got=per_second)
-    return per_second
+def _checked_fps(fps: float) -> float:
+    if not 0 < fps <= MAX_FPS:
+        raise OptionError("frames per second must be between 0 and a million", got=fps)
+    return fps
+
+
+def _is_video(path: Path, head: bytes) -> bool:
+    riff = head.startswith(b"RIFF") and head[8:11] == b"AVI"
+    return riff or head[4:8] == b"ftyp" or head.startswith(b"\x1aE\xdf\xa3")
+
+
+def _has_images(path: Path, head: bytes) -> bool:
+    others = ("events.txt", "metadata.yaml")
+    if not path.is_dir() or any((path / name).is_file() for name in others):
+        return False
+    return (path / "images.txt").is_file() or bool(list_images(path))
+
+
+VIDEO = Format(
+    "video",
+    open_video,
+    holds="frames",
+    marks="mp4, avi, mkv",
+    recognise=_is_video,
+    suffixes=(".mp4", ".avi", ".mov", ".mkv", ".webm"),
+    options=("fps",),
+)
+IMAGES = Format(
+    "images",
+    open_images,
+    holds="frames",
+    marks="a folder of PNG or JPEG",
+    recognise=_has_images,
+    options=("frame_unit", "fps", "times"),
+)

@@ -14,11 +14,12 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.preparation.ingest.ingest import Ingested, ingest
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
+from sharpfield.preparation.ingest.pipeline import Ingested, ingest
 from sharpfield.preparation.ingest.stage import Stage
-from sharpfield.recordings.open import ReaderOptions, open_recording
+from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.open import open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, simulate

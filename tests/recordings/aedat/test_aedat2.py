@@ -8,6 +8,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat2 import open_aedat2
+from sharpfield.recordings.format import ReaderOptions
 from tests.recordings import fuzz
 from tests.recordings.captured import expect_equal_events
 
@@ -87,7 +88,7 @@ def test_events_of_a_dvs128(tmp_path: Path) -> None:
     events = some_events(2000, 128, 128)
     records = [(dvs128_event(x, y, p), t) for x, y, t, p in rows(events)]
     path = recorded(tmp_path / "a.aedat", HEADER, records)
-    expect_equal_events(open_aedat2(path, size=(128, 128)).load(), events)
+    expect_equal_events(open_aedat2(path, ReaderOptions(size=(128, 128))).load(), events)
 
 
 @pytest.mark.parametrize("block", [1, 7, 64, 1000])
@@ -182,7 +183,7 @@ def test_the_camera_is_asked_for(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="does not say how large the sensor is"):
         open_aedat2(path)
     with pytest.raises(CaptureError) as refused:
-        open_aedat2(path, size=(320, 240))
+        open_aedat2(path, ReaderOptions(size=(320, 240)))
     assert str(refused.value) == (
         "CaptureError: addresses of this camera are not known\n"
         f"  where  {path}\n"
@@ -199,7 +200,9 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_real_recording(samples: Path) -> None:
-    read = open_aedat2(samples / "inivation" / "mnist_0_scale04_0001.aedat", size=(128, 128))
+    read = open_aedat2(
+        samples / "inivation" / "mnist_0_scale04_0001.aedat", ReaderOptions(size=(128, 128))
+    )
     events = read.load()
     assert len(events) == 15_744
     assert (events.t_us[0], events.t_us[-1]) == (0, 2_210_588)
@@ -209,7 +212,9 @@ def test_the_real_recording(samples: Path) -> None:
 
 def test_polarity_of_the_real_recording_fits_its_motion(samples: Path) -> None:
     """A bright digit wanders over a dark screen: it brightens ahead of itself."""
-    read = open_aedat2(samples / "inivation" / "mnist_0_scale04_0001.aedat", size=(128, 128))
+    read = open_aedat2(
+        samples / "inivation" / "mnist_0_scale04_0001.aedat", ReaderOptions(size=(128, 128))
+    )
     events = read.load()
     ahead = 0.0
     for start in range(0, 2_000_000, 100_000):

@@ -7,6 +7,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat3 import open_aedat3
+from sharpfield.recordings.format import ReaderOptions
 from tests.recordings import fuzz
 from tests.recordings.aedat.test_aedat2 import rows, some_events
 from tests.recordings.captured import expect_equal_events
@@ -132,11 +133,11 @@ def test_one_of_several_sources_is_chosen(tmp_path: Path) -> None:
         "  got    1 DAVIS346B, 2 DVS128\n"
         "  do     give the number of a source as topic"
     )
-    read = open_aedat3(path, topic="2")
+    read = open_aedat3(path, ReaderOptions(topic="2"))
     expect_equal_events(read.load(), events)
     assert read.frames is None
     with pytest.raises(CaptureError, match="no source that was chosen"):
-        open_aedat3(path, topic="3")
+        open_aedat3(path, ReaderOptions(topic="3"))
 
 
 def test_the_size_of_an_unknown_camera_is_asked_for(tmp_path: Path) -> None:
@@ -144,7 +145,7 @@ def test_the_size_of_an_unknown_camera_is_asked_for(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.aedat", polarities(some_events(9, 50, 40)), header=header)
     with pytest.raises(CaptureError, match="does not say how large the sensor is"):
         open_aedat3(path)
-    assert len(open_aedat3(path, size=(50, 40)).load()) == 9
+    assert len(open_aedat3(path, ReaderOptions(size=(50, 40))).load()) == 9
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat4 import open_aedat4
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.recording import Frame, Recording
 from tests.recordings import fuzz
 from tests.recordings.aedat.aedat4_writer import write_aedat4
@@ -248,10 +249,10 @@ def test_several_cameras_must_be_chosen_from(tmp_path: Path) -> None:
         "  got    0 EVTS of DAVIS_0, 1 EVTS of DAVIS_1\n"
         "  do     choose a topic: 0, or the name of a camera"
     )
-    expect_equal_events(open_aedat4(path, topic="1").load(), right)
-    expect_equal_events(open_aedat4(path, topic="DAVIS_0").load(), left)
+    expect_equal_events(open_aedat4(path, ReaderOptions(topic="1")).load(), right)
+    expect_equal_events(open_aedat4(path, ReaderOptions(topic="DAVIS_0")).load(), left)
     with pytest.raises(CaptureError, match="no stream or camera 2"):
-        open_aedat4(path, topic="2")
+        open_aedat4(path, ReaderOptions(topic="2"))
 
 
 def test_a_missing_file(tmp_path: Path) -> None:
@@ -266,15 +267,15 @@ def test_the_size_is_asked_for_where_the_file_does_not_say(tmp_path: Path) -> No
     )
     with pytest.raises(CaptureError, match="does not say how large the sensor is"):
         open_aedat4(path)
-    expect_equal_events(open_aedat4(path, size=(WIDTH, HEIGHT)).load(), events)
+    expect_equal_events(open_aedat4(path, ReaderOptions(size=(WIDTH, HEIGHT))).load(), events)
     with pytest.raises(CaptureError, match="no sensor has this size"):
-        open_aedat4(path, size=(0, 10))
+        open_aedat4(path, ReaderOptions(size=(0, 10)))
 
 
 def test_a_size_that_contradicts_the_file_is_refused(tmp_path: Path) -> None:
     write_aedat4(tmp_path / "a.aedat4", some_recording())
     with pytest.raises(CaptureError, match="640 x 480 given, 12 x 10 in the file"):
-        open_aedat4(tmp_path / "a.aedat4", size=(640, 480))
+        open_aedat4(tmp_path / "a.aedat4", ReaderOptions(size=(640, 480)))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.prophesee import dat
 from sharpfield.recordings.prophesee.dat import open_dat
 from tests.recordings import fuzz
@@ -44,7 +45,7 @@ fuzz.register(
 
 
 def test_real_cars(samples: Path) -> None:
-    recording = open_dat(samples / "prophesee/sample_ncars.dat", size=(120, 100))
+    recording = open_dat(samples / "prophesee/sample_ncars.dat", ReaderOptions(size=(120, 100)))
     events = recording.load()
     assert len(events) == 2_009
     assert (events.t_us[-1], (events.p == 1).sum()) == (99_952, 1_350)

@@ -5,6 +5,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import format_of
 from sharpfield.recordings.prophesee.evt import decoded, open_evt, trigger_edges
 from sharpfield.recordings.recording import ReadLog
@@ -410,9 +411,11 @@ def test_headers_that_do_not_do(header: str, message: str, tmp_path: Path) -> No
 def test_what_the_header_does_not_say_may_be_given(tmp_path: Path) -> None:
     data = evt3(high3(0), low3(1), y3(1), x3(4, 1))
     path = write(tmp_path, "% end\n", data)
-    assert listed(open_evt(path, size=(64, 48), encoding="evt3").load()) == [(4, 1, 1, 1)]
+    assert listed(open_evt(path, ReaderOptions(size=(64, 48), event_encoding="evt3")).load()) == [
+        (4, 1, 1, 1)
+    ]
     with pytest.raises(OptionError, match="unknown encoding"):
-        open_evt(path, size=(64, 48), encoding="evt9")
+        open_evt(path, ReaderOptions(size=(64, 48), event_encoding="evt9"))
 
 
 def test_another_encoding_is_noticed(tmp_path: Path) -> None:
@@ -464,11 +467,11 @@ def test_a_header_alone_whose_last_line_does_not_end(tmp_path: Path) -> None:
 
 def test_the_caller_decides_between_sizes(tmp_path: Path) -> None:
     path = write(tmp_path, "% evt 3.0\n% geometry 64x48\n% width 32\n% height 24\n% end\n")
-    assert open_evt(path, size=(32, 24)).size == (32, 24)
+    assert open_evt(path, ReaderOptions(size=(32, 24))).size == (32, 24)
     with pytest.raises(CaptureError, match="more than one size"):
-        open_evt(path, size=(16, 16))
+        open_evt(path, ReaderOptions(size=(16, 16)))
     path = write(tmp_path, "% evt 3.0\n% plugin_name hal_plugin_gen31_fx3\n% end\n")
-    assert open_evt(path, size=(320, 240)).size == (320, 240)
+    assert open_evt(path, ReaderOptions(size=(320, 240))).size == (320, 240)
     path = write(tmp_path, "% evt 3.0\n% geometry 64x48\n% end\n")
     with pytest.raises(CaptureError, match="the size given is not the one in the file"):
-        open_evt(path, size=(320, 240))
+        open_evt(path, ReaderOptions(size=(320, 240)))

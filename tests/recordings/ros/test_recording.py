@@ -9,6 +9,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.recordings.ros.recording import open_rosbag
 from tests.recordings import fuzz
@@ -146,11 +147,11 @@ def test_images(tmp_path: Path, container: str) -> None:
         ("/images", IMAGE, ros.image(name, data, stamp_ns=10**9 + i, padding=5), i)
         for i, (name, data) in enumerate(stored)
     ]
-    read = open_rosbag(ros.write(tmp_path, sent), exposure_us=300)
+    read = open_rosbag(ros.write(tmp_path, sent))
     frames = list(read.frames())
     for frame, expected in zip(frames, [grey, deep, colour, colour], strict=True):
         np.testing.assert_array_equal(frame.image, expected)
-        assert (frame.open_us, frame.close_us) == (10**6, 10**6 + 300)
+        assert (frame.open_us, frame.close_us) == (10**6, 10**6)
     assert read.events is None and not str(read.trouble)
 
 
@@ -391,13 +392,13 @@ def test_one_of_several_topics_is_chosen(tmp_path: Path) -> None:
         "  do     choose one: topic=/left/events"
     )
     with pytest.raises(CaptureError, match="several topics of images"):
-        open_rosbag(path, topic="/left/events")
-    read = open_rosbag(path, topic="/right/events", image_topic="/left/image_raw")
+        open_rosbag(path, ReaderOptions(topic="/left/events"))
+    read = open_rosbag(path, ReaderOptions(topic="/right/events", image_topic="/left/image_raw"))
     expect_equal_events(read.load(), right)
     assert len(list(read.frames())) == 1
-    assert open_rosbag(path, topic="/left/events", image_topic="").frames is None
+    assert open_rosbag(path, ReaderOptions(topic="/left/events", image_topic="")).frames is None
     with pytest.raises(CaptureError, match="the bag has no topic /middle of a known type"):
-        open_rosbag(path, topic="/middle")
+        open_rosbag(path, ReaderOptions(topic="/middle"))
 
 
 def test_unknown_encodings_are_refused(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.tables.hdf5 import open_hdf5
 from sharpfield.storage.event_writer import write_events
 from tests.recordings import fuzz
@@ -109,7 +110,7 @@ def test_each_dialect_gives_the_same_events(
     path = tmp_path / "events.h5"
     with h5py.File(path, "w") as file:
         write(file)
-    recording = open_hdf5(path, **options)
+    recording = open_hdf5(path, ReaderOptions(**options))
     found = recording.load()
     assert recording.layout == layout
     assert recording.size == SIZE
@@ -128,30 +129,32 @@ def test_frames_of_a_file_that_has_them(tmp_path):
     for write, options in ((event_utils, {}), (mvsec, {"topic": "left"})):
         with h5py.File(tmp_path / "e.h5", "w") as file:
             write(file)
-        frames = list(open_hdf5(tmp_path / "e.h5", **options).frames())
+        frames = list(open_hdf5(tmp_path / "e.h5", ReaderOptions(**options)).frames())
         assert [frame.image.shape for frame in frames][:2] == [(HEIGHT, WIDTH)] * 2
         assert frames[1].open_us - frames[0].open_us in (10_000, 30_000)
     with h5py.File(tmp_path / "e.h5", "w") as file:
         v2e(file)
-    assert open_hdf5(tmp_path / "e.h5", size=SIZE).frames is None
+    assert open_hdf5(tmp_path / "e.h5", ReaderOptions(size=SIZE)).frames is None
 
 
 def test_frames_of_m3ed_are_those_of_the_same_side_unless_told(tmp_path):
     path = tmp_path / "e.h5"
     with h5py.File(path, "w") as file:
         m3ed(file)
-    frames = list(open_hdf5(path, topic="right").frames())
+    frames = list(open_hdf5(path, ReaderOptions(topic="right")).frames())
     assert [frame.open_us for frame in frames] == [0, 40_000, 80_000]
     np.testing.assert_array_equal(frames[1].image, 49 + np.arange(48).reshape(6, 8))
-    (red, green, blue) = next(open_hdf5(path, topic="left", image_topic="rgb").frames()).image[0, 0]
+    (red, green, blue) = next(
+        open_hdf5(path, ReaderOptions(topic="left", image_topic="rgb")).frames()
+    ).image[0, 0]
     assert (red, green, blue) == (2, 1, 0)
-    assert open_hdf5(path, topic="left", image_topic="").frames is None
+    assert open_hdf5(path, ReaderOptions(topic="left", image_topic="")).frames is None
     with pytest.raises(CaptureError, match="no frames of that camera") as caught:
-        open_hdf5(path, topic="left", image_topic="middle")
+        open_hdf5(path, ReaderOptions(topic="left", image_topic="middle"))
     assert "left, rgb, right" in str(caught.value)
     with h5py.File(path, "a") as file:
         del file["ovc"]
-    assert open_hdf5(path, topic="left").frames is None
+    assert open_hdf5(path, ReaderOptions(topic="left")).frames is None
 
 
 # Questions and damage
@@ -164,17 +167,17 @@ def test_one_of_several_cameras_has_to_be_named(tmp_path):
         open_hdf5(tmp_path / "e.h5")
     assert "left, right" in str(caught.value)
     with pytest.raises(CaptureError, match="no such camera"):
-        open_hdf5(tmp_path / "e.h5", topic="middle")
+        open_hdf5(tmp_path / "e.h5", ReaderOptions(topic="middle"))
 
 
 def test_what_is_no_file_of_events(tmp_path):
     with h5py.File(tmp_path / "e.h5", "w") as file:
         file["CD/indexes"] = np.zeros(3)
     with pytest.raises(CaptureError, match="convert Prophesee's own HDF5"):
-        open_hdf5(tmp_path / "e.h5", size=SIZE)
+        open_hdf5(tmp_path / "e.h5", ReaderOptions(size=SIZE))
     (tmp_path / "e.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(CaptureError, match="cannot open the event file"):
-        open_hdf5(tmp_path / "e.h5", size=SIZE)
+        open_hdf5(tmp_path / "e.h5", ReaderOptions(size=SIZE))
 
 
 def test_no_length_is_believed_that_a_damaged_superblock_tells(tmp_path):
@@ -184,14 +187,14 @@ def test_no_length_is_believed_that_a_damaged_superblock_tells(tmp_path):
     data[48:56] = (0xFF).to_bytes(8, "little")
     path.write_bytes(data)
     with pytest.raises(CaptureError, match="a superblock that goes on elsewhere"):
-        open_hdf5(path, size=SIZE)
+        open_hdf5(path, ReaderOptions(size=SIZE))
 
 
 def test_the_size_of_another_sensor_is_refused(tmp_path):
     with h5py.File(tmp_path / "e.h5", "w") as file:
         dsec(file)
     with pytest.raises(CaptureError, match="most events lie outside the sensor") as caught:
-        open_hdf5(tmp_path / "e.h5", size=(3, 3)).load()
+        open_hdf5(tmp_path / "e.h5", ReaderOptions(size=(3, 3))).load()
     assert "check the size" in str(caught.value)
 
 
@@ -208,7 +211,7 @@ def test_a_part_that_cannot_be_unpacked_ends_the_events(tmp_path, monkeypatch):
     data = bytearray(path.read_bytes())
     data[place.byte_offset] ^= 0xFF
     path.write_bytes(data)
-    recording = open_hdf5(path, size=SIZE)
+    recording = open_hdf5(path, ReaderOptions(size=SIZE))
     assert len(recording.load()) == 200
     assert str(recording.trouble) == "300 events from a damaged part onwards"
 
@@ -224,7 +227,7 @@ def test_the_packing_of_prophesee_needs_its_plugin(tmp_path):
             file.create_group("CD").id, b"events", h5py.h5t.py_create(kind), space, settings
         )
     with pytest.raises(CaptureError, match="compressed in a way that cannot be read") as caught:
-        open_hdf5(tmp_path / "e.h5", size=SIZE)
+        open_hdf5(tmp_path / "e.h5", ReaderOptions(size=SIZE))
     assert "Prophesee's ECF" in str(caught.value)
 
 
@@ -238,9 +241,16 @@ def _bytes(write: Callable) -> Callable[[], bytes]:
     return made
 
 
-fuzz.register("hdf5-dsec", fuzz.Case(_bytes(dsec), lambda p: open_hdf5(p, size=SIZE), ".h5"))
-fuzz.register("hdf5-m3ed", fuzz.Case(_bytes(m3ed), lambda p: open_hdf5(p, topic="left"), ".h5"))
-fuzz.register("hdf5-mvsec", fuzz.Case(_bytes(mvsec), lambda p: open_hdf5(p, topic="left"), ".h5"))
+fuzz.register(
+    "hdf5-dsec", fuzz.Case(_bytes(dsec), lambda p: open_hdf5(p, ReaderOptions(size=SIZE)), ".h5")
+)
+fuzz.register(
+    "hdf5-m3ed", fuzz.Case(_bytes(m3ed), lambda p: open_hdf5(p, ReaderOptions(topic="left")), ".h5")
+)
+fuzz.register(
+    "hdf5-mvsec",
+    fuzz.Case(_bytes(mvsec), lambda p: open_hdf5(p, ReaderOptions(topic="left")), ".h5"),
+)
 
 
 @pytest.mark.parametrize("name", ["hdf5-dsec", "hdf5-mvsec"])
@@ -252,6 +262,6 @@ def test_damaged_files_end_well(tmp_path, name):
 def test_the_sample_of_ev_deblur_nerf(samples):
     path = samples / "blender" / "atelier" / "events.h5"
     with pytest.raises(CaptureError, match="1.2 s if ns"):
-        open_hdf5(path, size=(300, 200))
-    found = open_hdf5(path, size=(300, 200), unit="ns").load()
+        open_hdf5(path, ReaderOptions(size=(300, 200)))
+    found = open_hdf5(path, ReaderOptions(size=(300, 200), unit="ns")).load()
     assert len(found) == 1_820_374

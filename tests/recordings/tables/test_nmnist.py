@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.tables.npz import SIZES, open_nmnist
 from tests.recordings import fuzz
 
@@ -20,7 +21,7 @@ def random_records() -> bytes:
 
 
 def open_small(path: Path):
-    return open_nmnist(path, size=(34, 34))
+    return open_nmnist(path, ReaderOptions(size=(34, 34)))
 
 
 fuzz.register("nmnist", fuzz.Case(random_records, open_small, ".bin"))
@@ -36,7 +37,7 @@ fuzz.register("nmnist", fuzz.Case(random_records, open_small, ".bin"))
 def test_real_files(
     name: str, size: tuple[int, int], count: int, first_us: int, last_us: int, samples: Path
 ) -> None:
-    recording = open_nmnist(samples / "ncaltech_nmnist" / name, size=size)
+    recording = open_nmnist(samples / "ncaltech_nmnist" / name, ReaderOptions(size=size))
     events = recording.load()
     assert (len(events), events.t_us[0], events.t_us[-1]) == (count, first_us, last_us)
     assert not str(recording.trouble)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.tables import npz
 from sharpfield.recordings.tables.npz import open_npy, open_npz, open_npz_folder
 from sharpfield.storage.event_formats import exporting_events
@@ -52,7 +53,7 @@ def saved(path: Path, write: Callable, *args, **arrays) -> Path:
 
 def test_columns_in_ns(tmp_path):
     path = saved(tmp_path / "e.npz", np.savez_compressed, **columns(1000))
-    expect_same(open_npz(path, unit="ns", size=SIZE))
+    expect_same(open_npz(path, ReaderOptions(unit="ns", size=SIZE)))
 
 
 def test_what_we_write_says_its_unit_and_size(tmp_path):
@@ -63,21 +64,21 @@ def test_what_we_write_says_its_unit_and_size(tmp_path):
 
 def test_positions_are_in_ns(tmp_path):
     path = saved(tmp_path / "raw_events.npz", np.savez, **positions())
-    expect_same(open_npz(path, size=SIZE))
+    expect_same(open_npz(path, ReaderOptions(size=SIZE)))
 
 
 def test_a_folder_of_numbered_files_is_in_ns(tmp_path):
     for i, part in enumerate(np.array_split(np.arange(len(EVENTS)), 3)):
         pieces = {name: column[part] for name, column in columns(1000).items()}
         np.savez(tmp_path / f"{i:010d}.npz", **pieces)
-    expect_same(open_npz_folder(tmp_path, size=SIZE))
+    expect_same(open_npz_folder(tmp_path, ReaderOptions(size=SIZE)))
 
 
 @pytest.mark.parametrize("order", ["xytp", "txyp"])
 @pytest.mark.parametrize("kind", [np.float64, np.int64, np.float32])
 def test_columns_of_a_table_are_told_by_what_they_hold(tmp_path, order, kind):
     path = saved(tmp_path / "e.npy", np.save, table(order, kind))
-    recording = open_npy(path, unit="us", size=SIZE)
+    recording = open_npy(path, ReaderOptions(unit="us", size=SIZE))
     assert recording.layout == f"npy table {order}"
     expect_same(recording)
 
@@ -88,7 +89,9 @@ def test_records(tmp_path):
     for name, column in (*found.items(), ("polarity", found["p"])):
         if name in records.dtype.names:
             records[name] = column
-    expect_same(open_npy(saved(tmp_path / "e.npy", np.save, records), unit="us", size=SIZE))
+    expect_same(
+        open_npy(saved(tmp_path / "e.npy", np.save, records), ReaderOptions(unit="us", size=SIZE))
+    )
 
 
 # Reading piece by piece gives what reading at once gives
@@ -99,7 +102,7 @@ def test_the_length_of_chunks_changes_nothing(tmp_path, monkeypatch, chunk):
     monkeypatch.setattr("sharpfield.recordings.tables.columns.CHUNK", chunk)
     monkeypatch.setattr(npz, "CHUNK", chunk)
     path = saved(tmp_path / "e.npy", np.save, table("txyp"))
-    expect_same(open_npy(path, unit="us", size=SIZE))
+    expect_same(open_npy(path, ReaderOptions(unit="us", size=SIZE)))
 
 
 # Events that cannot be
@@ -107,21 +110,27 @@ def test_the_length_of_chunks_changes_nothing(tmp_path, monkeypatch, chunk):
 
 def test_events_beside_the_sensor_are_counted(tmp_path):
     wide = columns() | {"x": np.where(np.arange(500) % 10 == 0, 60_000, EVENTS.x).astype(np.int64)}
-    recording = open_npz(saved(tmp_path / "e.npz", np.savez, **wide), unit="us", size=SIZE)
+    recording = open_npz(
+        saved(tmp_path / "e.npz", np.savez, **wide), ReaderOptions(unit="us", size=SIZE)
+    )
     assert len(recording.load()) == 450
     assert str(recording.trouble) == "50 events outside the sensor"
 
 
 def test_rectified_positions_stay_between_pixels(tmp_path):
     shifted = columns() | {"x": EVENTS.x + 0.25, "y": EVENTS.y - 0.5}
-    found = open_npz(saved(tmp_path / "e.npz", np.savez, **shifted), unit="us", size=SIZE).load()
+    found = open_npz(
+        saved(tmp_path / "e.npz", np.savez, **shifted), ReaderOptions(unit="us", size=SIZE)
+    ).load()
     assert found.rectified
     np.testing.assert_array_equal(found.x, EVENTS.x + 0.25)
 
 
 def test_no_events_at_all(tmp_path):
     none = {name: column[:0] for name, column in columns().items()}
-    recording = open_npz(saved(tmp_path / "e.npz", np.savez, **none), unit="us", size=SIZE)
+    recording = open_npz(
+        saved(tmp_path / "e.npz", np.savez, **none), ReaderOptions(unit="us", size=SIZE)
+    )
     assert len(recording.load()) == 0
 
 
@@ -131,25 +140,27 @@ def test_no_events_at_all(tmp_path):
 def test_the_unit_is_asked_for_with_what_each_would_mean(tmp_path):
     path = saved(tmp_path / "e.npz", np.savez, **columns())
     with pytest.raises(CaptureError, match="does not say the unit") as caught:
-        open_npz(path, size=SIZE)
+        open_npz(path, ReaderOptions(size=SIZE))
     assert "0.08" in str(caught.value) and "s if us" in str(caught.value)
     with pytest.raises(CaptureError, match="size of its sensor"):
-        open_npz(path, unit="us")
+        open_npz(path, ReaderOptions(unit="us"))
 
 
 def test_a_folder_of_other_names_does_not_say_its_unit(tmp_path):
     np.savez(tmp_path / "seq1.npz", **columns())
     with pytest.raises(CaptureError, match="does not say the unit"):
-        open_npz_folder(tmp_path, size=SIZE)
+        open_npz_folder(tmp_path, ReaderOptions(size=SIZE))
 
 
 def test_a_table_that_may_be_either_is_asked_about(tmp_path):
     rows = np.array([[1, 1, 2, 1], [2, 2, 3, 0]])
     path = saved(tmp_path / "e.npy", np.save, rows)
     with pytest.raises(CaptureError, match="cannot tell which column is which") as caught:
-        open_npy(path, unit="us", size=SIZE)
+        open_npy(path, ReaderOptions(unit="us", size=SIZE))
     assert "xytp, txyp" in str(caught.value)
-    assert open_npy(path, unit="us", size=SIZE, columns="txyp").load().t_us.tolist() == [1, 2]
+    assert open_npy(
+        path, ReaderOptions(unit="us", size=SIZE, columns="txyp")
+    ).load().t_us.tolist() == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -165,20 +176,20 @@ def test_a_table_that_may_be_either_is_asked_about(tmp_path):
 def test_unsound_columns_are_refused(tmp_path, wrong, message):
     path = saved(tmp_path / "e.npz", np.savez, **(columns() | wrong))
     with pytest.raises(CaptureError, match=message):
-        open_npz(path, unit="us", size=SIZE).load()
+        open_npz(path, ReaderOptions(unit="us", size=SIZE)).load()
 
 
 def test_time_that_goes_back_between_files_is_refused(tmp_path):
     for i in range(2):
         np.savez(tmp_path / f"{i:010d}.npz", **columns(1000))
     with pytest.raises(CaptureError, match="at the end of the file before"):
-        open_npz_folder(tmp_path, size=SIZE).load()
+        open_npz_folder(tmp_path, ReaderOptions(size=SIZE)).load()
 
 
 def test_pickled_npy_is_refused(tmp_path):
     path = saved(tmp_path / "e.npy", np.save, np.array([{}], object))
     with pytest.raises(CaptureError, match="pickled"):
-        open_npy(path, unit="us", size=SIZE)
+        open_npy(path, ReaderOptions(unit="us", size=SIZE))
 
 
 def _bytes(write: Callable, *args, **arrays) -> bytes:
@@ -191,21 +202,23 @@ fuzz.register(
     "npz",
     fuzz.Case(
         lambda: _bytes(np.savez_compressed, **columns()),
-        lambda path: open_npz(path, unit="us", size=SIZE),
+        lambda path: open_npz(path, ReaderOptions(unit="us", size=SIZE)),
         ".npz",
     ),
 )
 fuzz.register(
     "npz-positions",
     fuzz.Case(
-        lambda: _bytes(np.savez, **positions()), lambda path: open_npz(path, size=SIZE), ".npz"
+        lambda: _bytes(np.savez, **positions()),
+        lambda path: open_npz(path, ReaderOptions(size=SIZE)),
+        ".npz",
     ),
 )
 fuzz.register(
     "npy",
     fuzz.Case(
         lambda: _bytes(np.save, table("txyp")),
-        lambda path: open_npy(path, unit="us", size=SIZE),
+        lambda path: open_npy(path, ReaderOptions(unit="us", size=SIZE)),
         ".npy",
     ),
 )
@@ -219,7 +232,8 @@ def test_damaged_files_end_well(tmp_path, name):
 
 def test_the_sample_of_a_table(samples):
     found = open_npy(
-        samples / "ecd_tubrip" / "boxes_rotation" / "events.npy", unit="s", size=(240, 180)
+        samples / "ecd_tubrip" / "boxes_rotation" / "events.npy",
+        ReaderOptions(unit="s", size=(240, 180)),
     )
     assert len(found.load()) == 29_158
     assert found.layout == "npy table txyp"

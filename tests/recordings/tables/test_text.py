@@ -7,6 +7,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
+from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import format_of
 from sharpfield.recordings.tables import text
 from sharpfield.recordings.tables.text import open_text
@@ -41,7 +42,7 @@ def zipped(lines: str, *names: str) -> bytes:
 
 
 def open_davis(path: Path):
-    return open_text(path, size=DAVIS)
+    return open_text(path, ReaderOptions(size=DAVIS))
 
 
 fuzz.register("text", fuzz.Case(lambda: rpg_lines(200).encode(), open_davis, ".txt"))
@@ -115,7 +116,7 @@ def test_our_own_tables(tmp_path: Path) -> None:
     events = random_events(500)
     with exporting_events(tmp_path / "events.csv", events[:0]) as append:
         append(events)
-    found = open_text(tmp_path / "events.csv", size=(12, 10)).load()
+    found = open_text(tmp_path / "events.csv", ReaderOptions(size=(12, 10))).load()
     assert listed(found) == listed(events)
 
 
@@ -126,7 +127,7 @@ def test_names_tell_order_and_unit(tmp_path: Path) -> None:
 
 def test_unit_and_order_may_be_given(tmp_path: Path) -> None:
     path = write(tmp_path, "1 2 1500 0\n")
-    found = open_text(path, size=DAVIS, unit="ms", columns="xytp").load()
+    found = open_text(path, ReaderOptions(size=DAVIS, unit="ms", columns="xytp")).load()
     assert listed(found) == [(1_500_000, 1, 2, -1)]
 
 
@@ -180,20 +181,20 @@ def test_damaged_files_end_cleanly(name: str, tmp_path: Path) -> None:
 )
 def test_texts_that_do_not_do(lines: str, options: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match=message):
-        open_text(write(tmp_path, lines), **options).load()
+        open_text(write(tmp_path, lines), ReaderOptions(**options)).load()
 
 
 def test_options_that_do_not_do(tmp_path: Path) -> None:
     path = write(tmp_path, "0.1 2 3 1\n")
     with pytest.raises(OptionError, match="e.g. xytp"):
-        open_text(path, size=DAVIS, columns="xyzt")
+        open_text(path, ReaderOptions(size=DAVIS, columns="xyzt"))
     with pytest.raises(OptionError, match="unknown unit"):
-        open_text(path, size=DAVIS, unit="h")
+        open_text(path, ReaderOptions(size=DAVIS, unit="h"))
 
 
 def test_tables_of_prophesee(tmp_path: Path) -> None:
     path = write(tmp_path, "%geometry:64,48\n3,4,1,1000007\n5,6,0,1000009", "cd.csv")
     assert format_of(path) == "text"
-    recording = open_text(path, unit="us", columns="xypt")
+    recording = open_text(path, ReaderOptions(unit="us", columns="xypt"))
     assert recording.size == (64, 48)
     assert listed(recording.load()) == [(1000007, 3, 4, 1), (1000009, 5, 6, -1)]

@@ -32,6 +32,7 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import blocks, head
 from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT2.0"
@@ -71,12 +72,12 @@ class Layout:
         return self.size != DVS128
 
 
-def open_aedat2(path: Path, *, size: tuple[int, int] | None = None) -> Recording:
+def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of jAER.
 
     Args:
         path: Of the file.
-        size: Of the sensor, which tells the camera where the header does not.
+        options: `size`, which identifies the camera where the header does not.
 
     Raises:
         CaptureError: It is no AEDAT2, or its camera is not known.
@@ -89,7 +90,7 @@ def open_aedat2(path: Path, *, size: tuple[int, int] | None = None) -> Recording
         (line.partition(":")[2] for line in lines if line.startswith("AEChip:")), ""
     ).strip()
     stated = next((size for name, size in CAMERAS.items() if name in chip.lower()), None)
-    size = known_size(stated, size, path)
+    size = known_size(stated, options.size, path)
     if size not in CAMERAS.values():
         known = ", ".join(
             f"{width} x {height}" for width, height in dict.fromkeys(CAMERAS.values())
@@ -293,3 +294,13 @@ def _dvs128(address, t):
         elif word >> 16:
             unknown += 1
     return (x, y, t_us, p), count, unknown
+
+
+FORMAT = Format(
+    "aedat2",
+    open_aedat2,
+    holds="events, frames of DAVIS with exposures, triggers",
+    marks="`#!AER-DAT2`",
+    recognise=begins_with(b"#!AER-DAT2", b"#!AER-DAT1"),
+    suffixes=(".aedat",),
+)

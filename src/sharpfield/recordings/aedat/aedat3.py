@@ -26,6 +26,7 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import head
 from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE, LAST_LINE = b"#!AER-DAT3.1\r\n", b"#!END-HEADER\r\n"
@@ -98,15 +99,13 @@ class Layout:
     trouble: ReadLog = field(default_factory=ReadLog)
 
 
-def open_aedat3(
-    path: Path, *, size: tuple[int, int] | None = None, topic: str | None = None
-) -> Recording:
+def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of cAER.
 
     Args:
         path: Of the file.
-        size: Of the sensor, where the camera's name does not tell.
-        topic: Number of one of several sources.
+        options: `size`, where the camera's name does not tell it; `topic`, the number of one of
+            several sources.
 
     Raises:
         CaptureError: It is no AEDAT3.1, or has several sources and none was chosen.
@@ -122,8 +121,8 @@ def open_aedat3(
         )
     named = re.findall(r"^#Source (\d{1,4}): *([^\r\n]*)", start[:end].decode("latin-1"), re.M)
     sources = {int(number): name.strip() for number, name in named}
-    source = _chosen(sources, topic, path)
-    size = known_size(_size(sources[source]), size, path)
+    source = _chosen(sources, options.topic, path)
+    size = known_size(_size(sources[source]), options.size, path)
     layout = Layout(path, end + len(LAST_LINE), source)
     return Recording(
         path,
@@ -263,3 +262,13 @@ def _columns(words, since_us):
             t_us[count], p[count] = since_us + words[i, 1], 1 if word & 2 else -1
             count += 1
     return x, y, t_us, p, count
+
+
+FORMAT = Format(
+    "aedat3",
+    open_aedat3,
+    holds="events, frames with exposures, triggers",
+    marks="`#!AER-DAT3`",
+    recognise=begins_with(b"#!AER-DAT3"),
+    options=("size", "topic"),
+)

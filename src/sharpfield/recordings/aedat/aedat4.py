@@ -25,6 +25,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.aedat.flatbuffers import Table, root
 from sharpfield.recordings.bytes import Damaged, head, unpacked
 from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT4.0\r\n"
@@ -69,23 +70,21 @@ class Layout:
     trouble: ReadLog = field(default_factory=ReadLog)
 
 
-def open_aedat4(
-    path: Path, *, size: tuple[int, int] | None = None, topic: str | None = None
-) -> Recording:
+def open_aedat4(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of DV.
 
     Args:
         path: Of the file.
-        size: Of the event sensor, where the file does not say.
-        topic: Which of several cameras, by its name in the file, or by the number of a stream.
+        options: `size`, where the file does not give it; `topic`, which of several cameras, by its
+            name in the file or by the number of a stream.
 
     Raises:
         CaptureError: It is no AEDAT4; it has streams of several cameras and none was chosen.
     """
     layout = _layout(path)
-    events, frames = (_chosen(layout, kind, topic) for kind in ("EVTS", "FRME"))
+    events, frames = (_chosen(layout, kind, options.topic) for kind in ("EVTS", "FRME"))
     triggers = [stream.number for stream in layout.streams.values() if stream.kind == "TRIG"]
-    read_events = None
+    size, read_events = options.size, None
     if events is not None:
         size = known_size(layout.streams[events].size, size, path)
         read_events = partial(_events, layout, events, size)
@@ -298,3 +297,13 @@ def _columns(words):
         x[i], y[i] = word & 0xFFFF, (word >> 16) & 0xFFFF
         p[i] = 1 if (word >> 32) & 0xFF else -1
     return x, y, t_us, p
+
+
+FORMAT = Format(
+    "aedat4",
+    open_aedat4,
+    holds="events, frames with exposures, triggers",
+    marks="`#!AER-DAT4`",
+    recognise=begins_with(b"#!AER-DAT4"),
+    options=("size", "topic"),
+)

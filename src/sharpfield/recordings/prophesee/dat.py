@@ -24,8 +24,9 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import blocks, head
 from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt_decode import is_lone, step
-from sharpfield.recordings.prophesee.header import Header, read_header, stated_size
+from sharpfield.recordings.prophesee.header import Header, names_evt, read_header, stated_size
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EVENTS, EDGES = (0, 12), 14
@@ -44,12 +45,12 @@ STARTED, TIME, LONE = range(3)
 """What is remembered: whether there was a time, the last one, and how many were left out."""
 
 
-def open_dat(path: Path | str, *, size: tuple[int, int] | None = None) -> Recording:
+def open_dat(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a DAT file.
 
     Args:
         path: Of the file.
-        size: Width and height of the sensor, where the header does not say.
+        options: `size`, where the header does not give it.
 
     Raises:
         CaptureError: It is no such file, or the size is not known.
@@ -57,8 +58,8 @@ def open_dat(path: Path | str, *, size: tuple[int, int] | None = None) -> Record
     path = Path(path)
     header = read_header(path)
     edges = _kind(header, path) == EDGES
-    stated = stated_size(header, path, size)
-    size = stated or size if edges else known_size(stated, size, path)
+    stated = stated_size(header, path, options.size)
+    size = stated or options.size if edges else known_size(stated, options.size, path)
     version = 2 if (header.number("version") or 0) >= 2 else 1
     trouble = ReadLog()
 
@@ -166,3 +167,18 @@ def _decode(records, count, state, bits, columns, end):
         e += np.uint64(1)
     state[STARTED], state[TIME] = 1, time
     return np.int64(e)
+
+
+def _recognise(path: Path, head: bytes) -> bool:
+    other = path.suffix.lower() in (".raw", ".txt", ".csv")
+    return head.startswith(b"%") and not names_evt(head) and not other
+
+
+FORMAT = Format(
+    "dat",
+    open_dat,
+    holds="events",
+    marks="a header with `%` and no `% evt`",
+    recognise=_recognise,
+    suffixes=(".dat",),
+)

@@ -15,6 +15,7 @@ from jaxtyping import Int64
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.bytes import blocks
 from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt_decode import (
     NO_ROW,
     REMEMBERED,
@@ -28,7 +29,7 @@ from sharpfield.recordings.prophesee.evt_decode import (
     decode_evt3,
     decode_evt21,
 )
-from sharpfield.recordings.prophesee.header import Header, read_header, stated_size
+from sharpfield.recordings.prophesee.header import Header, names_evt, read_header, stated_size
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EDGES = 4096
@@ -69,23 +70,21 @@ COUNTS = {
 }
 
 
-def open_evt(
-    path: Path | str, *, size: tuple[int, int] | None = None, encoding: str | None = None
-) -> Recording:
+def open_evt(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a RAW file.
 
     Args:
         path: Of the file.
-        size: Width and height of the sensor, where the header does not say.
-        encoding: One of `ENCODINGS`; overrules what the header says.
+        options: `size`, where the header does not give it; `event_encoding`, one of `ENCODINGS`,
+            overrules the header.
 
     Raises:
         CaptureError: It is no such file, or size or encoding are not known.
     """
     path = Path(path)
     header = read_header(path)
-    chosen = _encoding(header, path, encoding)
-    size = known_size(stated_size(header, path, size), size, path)
+    chosen = _encoding(header, path, options.event_encoding)
+    size = known_size(stated_size(header, path, options.size), options.size, path)
     origin_us = header.number("time_origin_us") or 0
     bayer = header.fields.get("bayer", "")
     trouble = ReadLog()
@@ -260,3 +259,14 @@ def _halves_swapped(header: Header, path: Path) -> bool:
     maker = header.fields.get("integrator_name", "Prophesee")
     system = header.number("system_id")
     return maker == "Prophesee" and system is not None and 0 < system < LEGACY_BEFORE
+
+
+FORMAT = Format(
+    "evt",
+    open_evt,
+    holds="events, triggers",
+    marks="a header with `% evt`",
+    recognise=lambda path, head: names_evt(head),
+    suffixes=(".raw",),
+    options=("size", "event_encoding"),
+)

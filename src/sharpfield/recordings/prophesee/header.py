@@ -40,6 +40,13 @@ SYSTEMS = {
 """Width and height by `system_ID`, of Prophesee's own cameras."""
 
 
+def names_evt(head: bytes) -> bool:
+    """Whether a header says that a file is RAW: `% evt 3.0`, or `% format EVT3;...`."""
+    lines = [line[1:].lower().split() for line in head.split(b"\n") if line.startswith(b"%")]
+    words = [(*line, b"", b"")[:2] for line in lines]
+    return any(key == b"evt" or (key == b"format" and to.startswith(b"evt")) for key, to in words)
+
+
 @dataclass(frozen=True)
 class Header:
     """What the text says."""

@@ -9,9 +9,9 @@ it started to the sensor's clock. Prophesee's sensors (`evt3`, `mono`) count fro
 were switched on: the first event is set to the stamp of its packet, and all others keep their
 distance from it, since stamps of packets say when these arrived and not when light changed.
 
-Exposures: an image has one stamp, for when it opened its shutter. How long that was, the caller
-says; or a topic `<images>/exposure` of `sensor_msgs/TimeReference` does, whose header has
-the stamp of an image, and whose reference is the end of its exposure (we write bags so).
+Exposures: an image has one stamp, for when its shutter opened. A topic `<images>/exposure` of
+`sensor_msgs/TimeReference`, where there is one, gives the end: its header has the stamp of an
+image, and its reference is the end of the exposure of that image.
 """
 
 from collections.abc import Collection, Iterator
@@ -23,6 +23,7 @@ from pathlib import Path
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import Damaged, head
 from sharpfield.recordings.chunks import joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt import ENCODINGS as EVT_ENCODINGS
 from sharpfield.recordings.prophesee.evt import decoded, trigger_edges
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
@@ -76,42 +77,33 @@ class Source:
     """From the sensor's clock to that of the stamps."""
 
 
-def open_rosbag(
-    path: Path,
-    *,
-    size: tuple[int, int] | None = None,
-    topic: str | None = None,
-    image_topic: str | None = None,
-    exposure_us: int = 0,
-) -> Recording:
+def open_rosbag(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a bag.
 
     Args:
         path: A `.bag`, `.mcap` or `.db3`, or the folder of a bag of ROS 2.
-        size: Of the event sensor, where messages do not say.
-        topic: Of the events, where there are several such topics.
-        image_topic: Of the images, where there are several such topics; "" for none.
-        exposure_us: How long each image was exposed, from its stamp on.
+        options: `size`, where messages do not give it; `topic` of the events and `image_topic` of
+            the images, where there are several such topics; an empty image topic for no images.
 
     Raises:
         CaptureError: It is no bag, holds neither events nor images, or several topics of either
             and none was chosen.
     """
     bag, trouble = _opened(path), ReadLog()
-    events = _chosen(bag, EVENT_TYPES, topic, "topic")
+    events, image_topic = _chosen(bag, EVENT_TYPES, options.topic, "topic"), options.image_topic
     images = None if image_topic == "" else _chosen(bag, IMAGE_TYPES, image_topic, "image_topic")
     if events is None and images is None:
         raise CaptureError(
             "the bag holds neither events nor images", where=path, got=_listed(bag, bag.topics)
         )
-    source = None if events is None else _source(bag, events, size)
+    source = None if events is None else _source(bag, events, options.size)
     encoded = source is not None and source.encoding in EVT_ENCODINGS
     return Recording(
         path,
         bag.layout,
-        size if source is None else source.size,
+        options.size if source is None else source.size,
         events=None if source is None else partial(_events, source, trouble),
-        frames=None if images is None else partial(_frames, bag, images, exposure_us, trouble),
+        frames=None if images is None else partial(_frames, bag, images, trouble),
         triggers=partial(_triggers, source) if source is not None and encoded else None,
         bayer="" if images is None else _bayer(bag, images),
         trouble=trouble,
@@ -268,7 +260,7 @@ def _bayer(bag: Bag, topic: str) -> str:
     return next((found.bayer for found in _images(bag, topic, ReadLog())), "")
 
 
-def _frames(bag: Bag, topic: str, exposure_us: int, trouble: ReadLog) -> Iterator[Frame]:
+def _frames(bag: Bag, topic: str, trouble: ReadLog) -> Iterator[Frame]:
     trouble = trouble.anew("frames")
     ends = _exposure_ends(bag, f"{topic}/exposure", trouble)
     before = None
@@ -278,7 +270,7 @@ def _frames(bag: Bag, topic: str, exposure_us: int, trouble: ReadLog) -> Iterato
             trouble.note("frames earlier than those before them")
             continue
         before = opened
-        yield Frame(found.image, opened, max(opened, ends.get(opened, opened + exposure_us)))
+        yield Frame(found.image, opened, max(opened, ends.get(opened, opened)))
 
 
 def _images(bag: Bag, topic: str, trouble: ReadLog) -> Iterator[Image]:
@@ -305,3 +297,18 @@ def _exposure_ends(bag: Bag, topic: str, trouble: ReadLog) -> dict[int, int]:
             continue
         ends[(opened_ns + 500) // 1000] = (closed_ns + 500) // 1000
     return ends
+
+
+def _recognise(path: Path, head: bytes) -> bool:
+    return head.startswith(tuple(OPENERS)) or (path / "metadata.yaml").is_file()
+
+
+FORMAT = Format(
+    "rosbag",
+    open_rosbag,
+    holds="events, images, triggers",
+    marks="a bag of ROS 1, or of ROS 2 (SQLite, MCAP)",
+    recognise=_recognise,
+    suffixes=(".bag", ".db3", ".mcap"),
+    options=("size", "topic", "image_topic"),
+)

@@ -31,11 +31,18 @@ import h5py
 import numpy as np
 
 from sharpfield.core.errors import CaptureError
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.recordings.tables.columns import recording_of
 from sharpfield.storage.event_columns import known_unit, whole_us
 from sharpfield.storage.event_file import UNREADABLE, EventFile
-from sharpfield.storage.event_layouts import expect_filled, expect_filters, open_events, opened_hdf5
+from sharpfield.storage.event_layouts import (
+    SUPERBLOCK,
+    expect_filled,
+    expect_filters,
+    open_events,
+    opened_hdf5,
+)
 
 CAMERA = "*"
 """Stands in a path for the name of one of several cameras."""
@@ -107,36 +114,29 @@ class TableColumn:
         return self._table[part, self._column]
 
 
-def open_hdf5(
-    path: Path,
-    *,
-    unit: str | None = None,
-    size: tuple[int, int] | None = None,
-    topic: str | None = None,
-    image_topic: str | None = None,
-) -> Recording:
+def open_hdf5(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open an HDF5 file of events.
 
     Args:
         path: The file.
-        unit: Of its times (ns, us, ms, s), where it does not say.
-        size: Width and height of the sensor, where it does not say.
-        topic: Which of several cameras, e.g. "left".
-        image_topic: Which camera's frames, if not those of the same side; "" for none.
+        options: `unit` and `size`, where the file does not give them; `topic`, which of several
+            cameras, e.g. "left"; `image_topic`, which camera's frames, if not those of the same
+            side, or "" for none.
 
     Raises:
         CaptureError: It holds no events in a known layout, or does not say its unit or size.
     """
+    unit, size = options.unit, options.size
     with _whole(path):
         with opened_hdf5(path) as file:
             found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
         if not found:
             return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
-        dialect, camera = _chosen(found, topic, path)
+        dialect, camera = _chosen(found, options.topic, path)
         made = recording_of(
             dialect.layout, path, lambda: _event_file(path, dialect, camera, unit, size)
         )
-        return replace(made, frames=_frames(path, dialect, camera, image_topic))
+        return replace(made, frames=_frames(path, dialect, camera, options.image_topic))
 
 
 def _frames(
@@ -352,3 +352,13 @@ DIALECTS = (
     ),
 )
 """Ways to lay events out that `storage.open_events` does not know."""
+
+
+FORMAT = Format(
+    "hdf5",
+    open_hdf5,
+    holds="events; frames of M3ED, MVSEC and event_utils",
+    marks="HDF5",
+    recognise=begins_with(SUPERBLOCK),
+    options=("size", "unit", "topic", "image_topic"),
+)

@@ -34,13 +34,15 @@ import numpy as np
 from jaxtyping import Shaped
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import blocks, head
+from sharpfield.recordings.bytes import blocks, head, zip_holds
 from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.recordings.tables.columns import recording_of
 from sharpfield.storage.event_columns import ZippedColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
 from sharpfield.storage.event_layouts import UNREADABLE_NPZ, open_events
+from sharpfield.storage.images import list_images
 
 POSITION = {"position.npy", "timestamp.npy", "polarity.npy"}
 ORDERS = ("xytp", "txyp")
@@ -71,19 +73,17 @@ class Slice:
         return np.array(rows[:, self.column])
 
 
-def open_npz(
-    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
-) -> Recording:
+def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open an npz file of events.
 
     Args:
         path: The file.
-        unit: Of its times (ns, us, ms, s), where it does not say.
-        size: Width and height of the sensor, where it does not say.
+        options: `unit` and `size`, where the file does not give them.
 
     Raises:
         CaptureError: It holds no events in a known layout, or does not say its unit or size.
     """
+    unit, size = options.unit, options.size
     try:
         with zipfile.ZipFile(path) as archive:
             names = set(archive.namelist())
@@ -94,15 +94,12 @@ def open_npz(
     return recording_of("Robust e-NeRF npz", path, lambda: _positions(path, unit or "ns", size))
 
 
-def open_npz_folder(
-    path: Path, *, unit: str | None = None, size: tuple[int, int] | None = None
-) -> Recording:
+def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a folder of npz files, each of which goes on where the one before it ends.
 
     Args:
         path: The folder.
-        unit: Of their times; ns for the files of vid2e, which are told by their names.
-        size: Width and height of the sensor.
+        options: `unit` (ns by default for files of vid2e, known by their names) and `size`.
 
     Raises:
         CaptureError: There are none, or the unit or the size is not known.
@@ -110,9 +107,9 @@ def open_npz_folder(
     files = sorted(path.glob("*.npz"))
     if not files:
         raise CaptureError("no npz files found", where=path)
-    if unit is None and all(NUMBERED.fullmatch(file.name) for file in files):
-        unit = "ns"
-    opened = [open_npz(file, unit=unit, size=size) for file in files]
+    if options.unit is None and all(NUMBERED.fullmatch(file.name) for file in files):
+        options = replace(options, unit="ns")
+    opened = [open_npz(file, options) for file in files]
 
     trouble = ReadLog()
 
@@ -137,25 +134,18 @@ def open_npz_folder(
     return replace(opened[0], path=path, layout=layout, events=events, trouble=trouble)
 
 
-def open_npy(
-    path: Path,
-    *,
-    unit: str | None = None,
-    size: tuple[int, int] | None = None,
-    columns: str | None = None,
-) -> Recording:
+def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open an npy file of events: a table of four columns, or records.
 
     Args:
         path: The file.
-        unit: Of its times (ns, us, ms, s).
-        size: Width and height of the sensor.
-        columns: What the columns of a table are: "xytp" or "txyp".
+        options: `unit` and `size`; `columns`, the order of the columns of a table.
 
     Raises:
         CaptureError: It holds no events, or the unit, the size or the columns are not known.
     """
     array = _mapped(path)
+    unit = known_unit(options.unit) if options.unit else None
     if array.dtype.names is not None:
         fields = _fields(array, path)
         return recording_of(
@@ -164,8 +154,8 @@ def open_npy(
             lambda: EventFile(
                 path,
                 {name: Slice(array, field) for name, field in fields.items()},
-                unit=known_unit(unit) if unit else None,
-                size=size,
+                unit=unit,
+                size=options.size,
             ),
         )
     if array.ndim != 2 or array.shape[1] != len("xytp") or array.dtype.kind not in "iufb":
@@ -174,7 +164,7 @@ def open_npy(
             where=path,
             got=f"shape {array.shape}, {array.dtype}",
         )
-    order = columns or _order(array, path)
+    order = options.columns or _order(array, path)
     if sorted(order) != sorted("xytp"):
         raise CaptureError(
             "unknown order of columns", where=path, got=order, do='write it like "xytp" or "txyp"'
@@ -185,8 +175,8 @@ def open_npy(
         lambda: EventFile(
             path,
             {name: Slice(array, order.index(name)) for name in "xytp"},
-            unit=known_unit(unit) if unit else None,
-            size=size,
+            unit=unit,
+            size=options.size,
         ),
     )
 
@@ -300,12 +290,12 @@ NO_ROW, PAUSE_US = 240, 2**13
 """Row of a record that is no event, and the time it stands for."""
 
 
-def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Recording:
+def open_nmnist(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of N-MNIST or N-Caltech101.
 
     Args:
         path: Of the file.
-        size: Width and height of the sensor; see `SIZES`.
+        options: `size`; see `SIZES`.
 
     Raises:
         CaptureError: It is no such file, or the size is not given.
@@ -316,7 +306,7 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
         raise CaptureError(
             "the file holds no event", where=path, got="less than 5 bytes", do="copy it again"
         )
-    size = known_size(None, size, path)
+    size = known_size(None, options.size, path)
 
     def pieces(noted: ReadLog) -> Iterator[RawChunk]:
         rest, paused_us = b"", 0
@@ -337,3 +327,32 @@ def open_nmnist(path: Path | str, *, size: tuple[int, int] | None = None) -> Rec
         return joined(pieces(noted), size, where=path, trouble=noted)
 
     return Recording(path, "N-MNIST", size=size, events=events, trouble=trouble)
+
+
+NPZ = Format(
+    "npz",
+    open_npz,
+    holds="events",
+    marks="npz",
+    recognise=lambda path, head: zip_holds(path, head, ".npy"),
+    options=("size", "unit"),
+)
+NPZ_FOLDER = Format(
+    "npz-folder",
+    open_npz_folder,
+    holds="events",
+    marks="a folder of npz",
+    recognise=lambda path, head: (
+        path.is_dir() and any(path.glob("*.npz")) and not list_images(path)
+    ),
+    options=("size", "unit"),
+)
+NPY = Format(
+    "npy",
+    open_npy,
+    holds="events",
+    marks="npy",
+    recognise=begins_with(b"\x93NUMPY"),
+    options=("size", "unit", "columns"),
+)
+NMNIST = Format("nmnist", open_nmnist, "events", "the name FILE.bin", suffixes=(".bin",))

@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.bytes import BLOCK, blocks, head
+from sharpfield.recordings.bytes import BLOCK, ZIP, blocks, head, zip_holds
 from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.recordings.tables.text_decode import (
     BAD,
@@ -38,6 +39,7 @@ from sharpfield.recordings.tables.text_decode import (
     ZEROS,
     decode_lines,
 )
+from sharpfield.recordings.video import open_images
 from sharpfield.storage.event_columns import UNITS, known_unit
 
 USUAL = "txyp"
@@ -86,28 +88,21 @@ class Beginning:
     unit: str = ""
 
 
-def open_text(
-    path: Path | str,
-    *,
-    size: tuple[int, int] | None = None,
-    unit: str | None = None,
-    columns: str | None = None,
-) -> Recording:
+def open_text(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a text of events, or a zip archive that holds one.
 
     Args:
         path: Of the file.
-        size: Width and height of the sensor, where the text does not say.
-        unit: Of the times (ns, us, ms, s), where the text does not say.
-        columns: Their order, like "xytp", where there are no names.
+        options: `size` and `unit`, where the text does not give them; `columns`, their order, where
+            the text does not name them.
 
     Raises:
         CaptureError: It is no such file, or size or unit are not known.
         OptionError: There is no such unit, or no such order of columns.
     """
-    path = Path(path)
+    path, columns = Path(path), options.columns
     trouble = ReadLog()
-    read = _zipped(path) if head(path, 4) == b"PK\x03\x04" else lambda noted: blocks(path)
+    read = _zipped(path) if head(path, 4) == ZIP else lambda noted: blocks(path)
     start = next(read(ReadLog()), b"")
     begin = _beginning(start[:WHOLE_HEAD])
     order = begin.columns or columns or USUAL
@@ -121,8 +116,8 @@ def open_text(
             do="leave the columns out",
         )
     time = _first(start[begin.length : WHOLE_HEAD], order.index("t"))
-    unit = known_unit(unit) if unit else begin.unit or _unit(time, path)
-    size = known_size(begin.size, size, path)
+    unit = known_unit(options.unit) if options.unit else begin.unit or _unit(time, path)
+    size = known_size(begin.size, options.size, path)
     layout = np.array([*(order.index(name) for name in USUAL), POWERS[unit]], np.int64)
 
     def events() -> Chunks:
@@ -131,6 +126,17 @@ def open_text(
         return joined(pieces, size, where=path, trouble=noted)
 
     return Recording(path, "text", size=size, events=events, trouble=trouble)
+
+
+def open_rpg_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
+    """Open a folder of RPG's data set: `events.txt`, and `images.txt` with the images it lists.
+
+    Raises:
+        CaptureError: See `open_text` and `video.open_images`.
+    """
+    events = open_text(path / "events.txt", options)
+    listed = (path / "images.txt").is_file()
+    return replace(events, path=path, frames=open_images(path).frames if listed else None)
 
 
 def _beginning(text: bytes) -> Beginning:
@@ -255,3 +261,22 @@ def _zipped(path: Path) -> Blocks:
             noted.note("damaged archives, read up to the damage")
 
     return read
+
+
+FORMAT = Format(
+    "text",
+    open_text,
+    holds="events",
+    marks="a zip of events.txt",
+    recognise=lambda path, head: zip_holds(path, head, ".txt"),
+    suffixes=(".txt", ".csv"),
+    options=("size", "unit", "columns"),
+)
+RPG_FOLDER = Format(
+    "rpg-folder",
+    open_rpg_folder,
+    holds="events, frames",
+    marks="a folder with events.txt",
+    recognise=lambda path, head: (path / "events.txt").is_file(),
+    options=("size", "unit", "columns"),
+)

@@ -44,7 +44,7 @@ from sharpfield.recordings.recording import Recording
 NEAR, FAR = 1.0, 100.0
 """Stand-ins for the depth bounds of a scene that nobody has measured."""
 
-Tell = Callable[[str, int, int | None], None]
+Progress = Callable[[str, int, int | None], None]
 """Is told what is going on, how much of it is done, and how much there is, if that is known."""
 
 
@@ -66,7 +66,7 @@ class Ingested:
 
 
 def ingest(
-    recordings: tuple[Recording, ...], out: Path, choices: IngestOptions, tell: Tell
+    recordings: tuple[Recording, ...], out: Path, choices: IngestOptions, tell: Progress
 ) -> Ingested:
     """Make a capture of one recording, or of two that were taken together.
 
@@ -100,7 +100,7 @@ class _Ingest:
         frames: Recording | None,
         choices: IngestOptions,
         stage: Stage,
-        tell: Tell,
+        tell: Progress,
     ) -> None:
         self._events, self._frames = events, frames
         self._choices, self._stage, self._tell = choices, stage, tell
