@@ -1,18 +1,57 @@
-"""What a run was started with, as JSON beside it: recipe, options, capture, seed."""
+"""What a run was started with, as JSON beside it: recipe, options, capture, seed.
+
+And what follows from it: which part and which streams of the capture are used, which device.
+"""
 
 import dataclasses
+import difflib
 import json
 import types
 import typing
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from sharpfield.core.errors import RunError
+import torch
+
+from sharpfield.captures.blocks import blocks_of, limited, parsed
+from sharpfield.captures.read import read
+from sharpfield.core.capture import Capture
+from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.files import write_json
 from sharpfield.recipes import recipe_named
 
 FILE = "recipe.json"
+STREAMS = ("frames", "events")
+
+OWN_CAPTURE = "capture"
+"""Folder within a run that holds the capture it was trained on, if that existed only in memory."""
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """How to read a capture, where its layout is wrong or silent."""
+
+    layout: str | None = None
+    """By default it is recognised."""
+    event_unit: str | None = None
+    """Unit of event times: ns, us, ms or s."""
+    missing: Literal["error", "skip"] | None = None
+    """What to do about images that are named but not there."""
+    encoding: str | None = None
+    """How stored values relate to light: linear, gamma2.2 or srgb."""
+    hold_out: str | None = None
+    """Frames to hold out: every:8, train:5, last:5 or none."""
+    threshold: float | None = None
+    """Contrast threshold of both signs."""
+    trust_pickle: bool = False
+    """Open pickled files, which may name programs to run; only arrays of numbers are built from
+    them, and anything else is refused."""
+
+    def given(self) -> dict[str, Any]:
+        """What was not left open."""
+        return {name: value for name, value in vars(self).items() if value not in (None, False)}
 
 
 @dataclass(frozen=True)
@@ -22,16 +61,16 @@ class RunConfig:
     name: str
     """Of the recipe."""
     recipe: Any
-    """With all its numbers."""
+    """With all its options."""
     capture: str
-    """Folder it was trained on."""
+    """Folder it was trained on; a relative path is one within the run."""
     seed: int
-    use: tuple[str, ...] = ("frames", "events")
-    """Which streams of the capture were used."""
+    use: tuple[str, ...] = STREAMS
+    """Which streams of the capture are used."""
     reading: dict[str, Any] = field(default_factory=dict)
-    """How the capture was read, where its layout was not believed: options of `captures.read`."""
+    """Options of `captures.read` that the capture was read with."""
     block: str = ""
-    """Which part of a long capture it was trained on, "2/4"; "" for all of it."""
+    """Which block of a long capture it is trained on, "2/4"; "" for all of it."""
 
     def settings(self) -> dict[str, Any]:
         """As JSON; the length of the schedule is the run's own."""
@@ -45,10 +84,30 @@ class RunConfig:
             "options": dataclasses.asdict(self.recipe),
         }
 
+    def read_capture(self, run: Path, moved_to: Path | None = None) -> Capture:
+        """The capture of a run, or the block of it that the run was trained on.
 
-def write_run_config(run: Path, started: RunConfig) -> None:
+        Args:
+            run: The run's folder.
+            moved_to: Where the capture is now; or another one of the same scene and clock.
+
+        Raises:
+            CaptureError: It is gone, or cannot be read.
+        """
+        source = run / self.capture if moved_to is None else moved_to
+        if not source.exists():
+            raise CaptureError(
+                "the capture of this run is gone",
+                where=run,
+                got=source,
+                do="say where it is now: --capture FOLDER, or open_run(..., capture=FOLDER)",
+            )
+        return block_of(read(source, **self.reading), self.block)
+
+
+def write_run_config(run: Path, config: RunConfig) -> None:
     """Write `RUN/recipe.json`."""
-    write_json(run / FILE, started.settings())
+    write_json(run / FILE, config.settings())
 
 
 def read_run_config(run: Path) -> RunConfig:
@@ -70,7 +129,7 @@ def read_run_config(run: Path) -> RunConfig:
             dict(table.get("reading", {})),
             table.get("block", ""),
         )
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise RunError(
             "this is not a run", where=run, got=f"no {FILE}", do="name a folder that `train` made"
         ) from None
@@ -104,3 +163,101 @@ def _value(hint: Any, value: Any) -> Any:
         kinds = [k for k in typing.get_args(hint) if dataclasses.is_dataclass(k)]
         return from_table(typing.cast(type, kinds[0]), value)
     return value
+
+
+def with_options(recipe: Any, options: Mapping[str, Any]) -> Any:
+    """A recipe with some of its options changed.
+
+    Args:
+        recipe: A frozen dataclass, whose fields may be such dataclasses again.
+        options: New values by dotted name, such as `{"gaussians.degree": 3}`.
+
+    Raises:
+        OptionError: The recipe has no such option, or it takes another type of value.
+    """
+    for name, value in options.items():
+        recipe = _with_option(recipe, name, name.split("."), value)
+    return recipe
+
+
+def _with_option(part: Any, name: str, path: list[str], value: Any) -> Any:
+    first, *rest = path
+    known = {f.name for f in dataclasses.fields(part)} if dataclasses.is_dataclass(part) else set()
+    if first not in known:
+        close = difflib.get_close_matches(first, known, n=1)
+        raise OptionError(
+            f"unknown option {name!r}",
+            where=type(part).__name__,
+            do=f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(sorted(known))}",
+        )
+    if rest:
+        return replace(part, **{first: _with_option(getattr(part, first), name, rest, value)})
+    hint = typing.get_type_hints(type(part))[first]
+    if not _fits(value, hint):
+        raise OptionError(
+            f"the option {name!r} takes another type of value",
+            got=repr(value),
+            do=f"give {getattr(hint, '__name__', hint)}, such as {getattr(part, first)!r}",
+        )
+    return replace(part, **{first: tuple(value) if isinstance(value, list) else value})
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value may stand where a dataclass field asks for a type."""
+    kind, inner = typing.get_origin(hint), typing.get_args(hint)
+    if kind in (types.UnionType, typing.Union):
+        return any(_fits(value, one) for one in inner)
+    if kind is Literal:
+        return value in inner
+    if kind is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        if inner[-1:] == (...,):
+            return all(_fits(one, inner[0]) for one in value)
+        return len(value) == len(inner) and all(map(_fits, value, inner))
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def device_named(name: str) -> str:
+    """`auto` becomes cuda where there is one.
+
+    Raises:
+        OptionError: cuda was asked for and is not there, or there is no such kind of device.
+    """
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name not in ("cpu", "cuda"):
+        raise OptionError("unknown device", got=name, do="use auto, cpu or cuda")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise OptionError("there is no CUDA device", do="use the device cpu")
+    return name
+
+
+def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
+    """A capture with only some of its streams; without events, if its camera reported none.
+
+    Raises:
+        OptionError: A name is unknown.
+        CaptureError: Nothing is left.
+    """
+    if unknown := set(streams) - set(STREAMS):
+        raise OptionError("unknown stream", got=", ".join(unknown), do="use frames, events or both")
+    missing = {"frames": not capture.frames, "events": not capture.events}
+    left = [name for name in streams if not missing[name]]
+    if not left:
+        raise CaptureError(
+            f"the capture has no {' or '.join(streams)}", where=capture.name, do="use what it has"
+        )
+    return capture.without(frames="frames" not in left, events="events" not in left)
+
+
+def block_of(capture: Capture, block: str) -> Capture:
+    """The block of a capture that "2/4" names; all of it if nothing does."""
+    if not block:
+        return capture
+    index, count = parsed(block)
+    return limited(capture, blocks_of(capture, count)[index])

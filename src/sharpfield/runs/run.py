@@ -1,64 +1,56 @@
-"""A run from the command line's point of view: start one, open one again, measure it."""
+"""A trained run: what it shows, measured, and given to other programs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import torch
+import numpy as np
+from jaxtyping import Float32
 from rich.console import Console
 
-from sharpfield.captures.blocks import blocks_of, limited, parsed
-from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError, OptionError, RunError
+from sharpfield.core.errors import RunError
 from sharpfield.core.progress import progress_on
-from sharpfield.core.protocols import Model
 from sharpfield.evaluation.evaluate import Measuring, evaluate
+from sharpfield.evaluation.refine import Refinement, refine_poses
 from sharpfield.evaluation.report import Story, write_report
-from sharpfield.evaluation.views import validation
-from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
+from sharpfield.metrics.lpips import Lpips
+from sharpfield.runs.config import RunConfig, device_named, read_run_config, used
+from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
 from sharpfield.training.checkpoint import file_of, load, restore_weights
-from sharpfield.training.plan import Options
 from sharpfield.training.record import Ledger, read_ledger
-from sharpfield.training.session import require_unused, train
-
-STREAMS = ("frames", "events")
 
 
-@dataclass(frozen=True)
-class ReadOptions:
-    """How to read a capture, where its layout is not to be believed."""
+@dataclass(frozen=True, repr=False)
+class Run:
+    """A trained run in its folder. `open_run` opens one, `train` makes one.
 
-    layout: str | None = None
-    """By default it is recognised."""
-    event_unit: str | None = None
-    """Unit of event times: ns, us, ms or s."""
-    missing: Literal["error", "skip"] | None = None
-    """What to do about images that are named but not there."""
-    encoding: str | None = None
-    """How stored values relate to light: linear, gamma2.2 or srgb."""
-    hold_out: str | None = None
-    """Frames to hold out: every:8, train:5, last:5 or none."""
-    threshold: float | None = None
-    """Contrast threshold of both signs."""
-    trust_pickle: bool = False
-    """Open pickled files, which may name programs to run; only arrays of numbers are built from
-    them, and anything else is refused."""
+    Times are in us on the capture's clock; poses are world-from-camera in the capture's world
+    (x right, y down, z forward).
+    """
 
-    def given(self) -> dict[str, Any]:
-        """What was not left open."""
-        return {name: value for name, value in vars(self).items() if value not in (None, False)}
-
-
-@dataclass(frozen=True)
-class OpenedRun:
-    """A trained run."""
-
-    started: RunConfig
+    folder: Path
+    config: RunConfig
+    """What it was started with."""
     model: Any
+    """The trained `core.protocols.Model`, in a world of its own."""
     capture: Capture
-    """All of it, or its block; also what the model did not use."""
+    """All that was read, or its block; also what the model did not use."""
+
+    def __repr__(self) -> str:
+        ledger = self.ledger
+        steps = f"{ledger.steps} of {ledger.planned_steps} steps"
+        return f"Run({str(self.folder)!r}: {self.config.name} on {self.capture.name}, {steps})"
+
+    @property
+    def ledger(self) -> Ledger:
+        """Steps done and planned, time and memory spent.
+
+        Raises:
+            RunError: Training has not begun, or its record is damaged.
+        """
+        return _needed_ledger(self.folder)
 
     @property
     def seen(self) -> Capture:
@@ -68,131 +60,117 @@ class OpenedRun:
             return own
         return replace(own, frames=self.capture.frames, split=self.capture.split)
 
+    def render(
+        self,
+        at: At = None,
+        *,
+        time: float | None = None,
+        exposure: float | bool = False,
+        samples: int = 16,
+    ) -> Float32[np.ndarray, "h w 3"]:
+        """An image as the frames would store it, 0...1: sharp, or blurred by an exposure.
 
-def device_named(name: str) -> str:
-    """`auto` becomes cuda where there is one.
+        Args:
+            at: A frame by number, whose camera is followed; or a pose, [3, 4] or [4, 4], of a
+                camera that stands still; or None for the camera of the first track.
+            time: When, in us on the capture's clock; of an exposure, its middle. By default the
+                middle of the frame's exposure, or of the capture.
+            exposure: How long the shutter is open, in us; True for as long as the frame's was.
+            samples: Sharp views whose mean an exposure is.
 
-    Raises:
-        OptionError: cuda was asked for and is not there.
-    """
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise OptionError("there is no CUDA device", do="use --device cpu")
-    return name
+        Raises:
+            OptionError: There is no such frame, or the time is outside the capture.
+            ShapeError: The pose has another shape, or is none.
+        """
+        camera = viewpoint(self.model, self.capture, at, time)
+        if exposure is not True:
+            camera = replace(camera, exposure_us=float(exposure))
+        light = mean_light(self.model, self.capture, camera, samples)
+        return encoded(self.model, light)
 
+    def depth(self, at: At = None, *, time: float | None = None) -> Float32[np.ndarray, "h w"]:
+        """Expected depth along the camera's axis, in units of the capture's world.
 
-def used(capture: Capture, streams: tuple[str, ...]) -> Capture:
-    """A capture with only some of its streams; without events, if its camera reported none.
+        Args:
+            at: As for `render`.
+            time: As for `render`.
+        """
+        camera = viewpoint(self.model, self.capture, at, time)
+        return depth_along_axis(self.model, self.capture, camera)
 
-    Raises:
-        OptionError: A name is unknown.
-        CaptureError: Nothing is left.
-    """
-    if unknown := set(streams) - set(STREAMS):
-        raise OptionError("unknown stream", got=", ".join(unknown), do="use frames, events or both")
-    missing = {"frames": not capture.frames, "events": not capture.events}
-    left = [name for name in streams if not missing[name]]
-    if not left:
-        raise CaptureError(
-            f"the capture has no {' or '.join(streams)}", where=capture.name, do="use what it has"
+    def evaluate(
+        self,
+        *,
+        refine: Refinement | None = None,
+        train_views: int | None = None,
+        lpips: Lpips | None = None,
+        baselines: Mapping[str, Mapping[str, Any]] | None = None,
+        title: str = "",
+        console: Console | None = None,
+    ) -> dict[str, Any]:
+        """Measure it on held-out views; write `metrics.json` and `report.html` into its folder.
+
+        Args:
+            refine: Refine the held-out poses first, with the scene frozen, and how.
+            train_views: Most training views to render as well; None for all with known truth.
+            lpips: With its weights, to compute LPIPS.
+            baselines: Metrics of other methods, for the report; see `evaluation.evaluate`.
+            title: Of the report.
+            console: Where progress is shown.
+
+        Returns:
+            What is in `metrics.json`; the means over held-out views are under "mean".
+        """
+        volume = getattr(self.config.recipe, "volume", None)
+        poses, stated = {}, {"near_plane_removal": getattr(volume, "clear_before", 0.0)}
+        if refine is not None:
+            found = refine_poses(self.model, self.capture, how=refine)
+            poses, stated = found.poses, {**stated, **found.protocol}
+        with progress_on(console or Console()) as progress:
+            task = progress.add_task("rendering", total=None)
+            metrics = evaluate(
+                self.model,
+                self.capture,
+                self.folder,
+                measuring=Measuring(
+                    train_views=train_views, lpips=lpips, poses=poses, stated=stated
+                ),
+                baselines=baselines,
+                progress=lambda done, total: progress.update(task, completed=done, total=total),
+            )
+        story = Story(
+            title=title or f"{self.config.name} on {self.capture.name}",
+            paper=self.config.recipe.paper,
+            settings=self.config.settings(),
         )
-    return capture.without(frames="frames" not in left, events="events" not in left)
+        write_report(self.folder, self.capture, metrics, story)
+        return metrics
 
 
-def part_of(capture: Capture, block: str) -> Capture:
-    """The block of a capture that "2/4" names; all of it if nothing does."""
-    if not block:
-        return capture
-    index, count = parsed(block)
-    return limited(capture, blocks_of(capture, count)[index])
-
-
-def start(
-    started: RunConfig,
-    capture: Capture,
-    run: Path,
-    options: Options,
-    *,
-    device: str,
-    console: Console,
-) -> Ledger:
-    """Train a recipe on a capture in a run folder, or go on with it."""
-    part = part_of(capture, started.block)
-    chosen = used(part, started.use)
-
-    def build(steps: int) -> Model:
-        return started.recipe.lasting(steps).build(chosen, started.seed).to(device)
-
-    if not options.resume:
-        require_unused(run)
-        write_run_config(run, started)
-    return train(
-        build,
-        run,
-        options,
-        steps=started.recipe.steps,
-        settings=started.settings(),
-        validate=validation(part),
-        console=console,
-    )
-
-
-def open_run(run: Path, *, capture: Path | None = None, device: str = "auto") -> OpenedRun:
+def open_run(folder: Path | str, *, capture: Path | str | None = None, device: str = "auto") -> Run:
     """A run with its trained weights.
 
     Args:
-        run: Folder that `train` made.
+        folder: Of the run, as `train` made it.
         capture: Where the capture is now, if it moved; or another one of the same scene and clock.
-        device: Where the model goes.
+        device: Where the model goes: auto, cpu or cuda.
 
     Raises:
         RunError: The run has no checkpoint yet, or is damaged.
+        CaptureError: Its capture is gone, or cannot be read.
     """
-    started, ledger = read_run_config(run), read_ledger(run)
+    folder = Path(folder)
+    config = read_run_config(folder)
+    ledger = _needed_ledger(folder)
+    whole = config.read_capture(folder, None if capture is None else Path(capture))
+    recipe = config.recipe.lasting(ledger.planned_steps)
+    model = recipe.build(used(whole, config.use), config.seed)
+    restore_weights(load(file_of(folder, "last")), model)
+    return Run(folder, config, model.to(device_named(device)), whole)
+
+
+def _needed_ledger(folder: Path) -> Ledger:
+    ledger = read_ledger(folder)
     if ledger is None:
-        raise RunError("this run has not begun", where=run, do="train it first")
-    source = Path(started.capture) if capture is None else capture
-    if not source.exists():
-        raise CaptureError(
-            "the capture of this run is gone",
-            where=run,
-            got=source,
-            do="say where it is now with --capture",
-        )
-    whole = part_of(read(source, **started.reading), started.block)
-    model = started.recipe.lasting(ledger.planned_steps).build(
-        used(whole, started.use), started.seed
-    )
-    restore_weights(load(file_of(run, "last")), model)
-    return OpenedRun(started, model.to(device_named(device)), whole)
-
-
-def measure(
-    opened: OpenedRun,
-    run: Path,
-    console: Console,
-    *,
-    measuring: Measuring | None = None,
-    baselines: Mapping[str, Mapping[str, Any]] | None = None,
-    title: str = "",
-) -> dict[str, Any]:
-    """Evaluate a run and write its report."""
-    started = opened.started
-    with progress_on(console) as progress:
-        task = progress.add_task("rendering", total=None)
-        metrics = evaluate(
-            opened.model,
-            opened.capture,
-            run,
-            measuring=measuring,
-            baselines=baselines,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    story = Story(
-        title=title or f"{started.name} on {opened.capture.name}",
-        paper=started.recipe.paper,
-        settings=started.settings(),
-    )
-    write_report(run, opened.capture, metrics, story)
-    return metrics
+        raise RunError("this run has not begun", where=folder, do="train it first")
+    return ledger

@@ -1,0 +1,67 @@
+"""Starting a run, or going on with one: a recipe trained on a capture, in a folder."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from sharpfield.captures.native.layout import read, write
+from sharpfield.core.capture import Capture
+from sharpfield.core.protocols import Model
+from sharpfield.evaluation.views import validation
+from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
+from sharpfield.runs.run import Run
+from sharpfield.training.plan import Options
+from sharpfield.training.session import require_unused, train
+
+
+def start(
+    config: RunConfig,
+    capture: Capture,
+    folder: Path,
+    options: Options,
+    *,
+    device: str,
+    console: Console | None = None,
+) -> Run:
+    """Train a recipe on a capture in a run's folder, or go on with it.
+
+    Args:
+        config: Recipe, seed, and which part of the capture. A relative `capture` means one that
+            exists only in memory: it is written into the run, so that the run can be opened again.
+        capture: As read, all of it.
+        folder: Of the run.
+        options: How long, how often to save, how much memory.
+        device: `cpu` or `cuda`.
+        console: Where progress is shown.
+
+    Raises:
+        RunError: The folder holds another run, or a loss is not finite.
+    """
+    if not options.resume:
+        require_unused(folder)
+        write_run_config(folder, config)
+    if config.capture == OWN_CAPTURE:
+        if not options.resume or not (folder / OWN_CAPTURE).exists():
+            write(capture, folder / OWN_CAPTURE)
+        capture = read(folder / OWN_CAPTURE)  # what will be read when it is opened again
+    part = block_of(capture, config.block)
+    chosen = used(part, config.use)
+    built: list[Any] = []
+
+    def build(steps: int) -> Model:
+        built[:] = []  # a model that was only for measuring time makes room
+        model = config.recipe.lasting(steps).build(chosen, config.seed).to(device)
+        built.append(model)
+        return model
+
+    train(
+        build,
+        folder,
+        options,
+        steps=config.recipe.steps,
+        settings=config.settings(),
+        validate=validation(part),
+        console=console,
+    )
+    return Run(folder, config, built[-1], part)
