@@ -19,7 +19,8 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import measure, open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.plan import Options
@@ -82,7 +83,7 @@ def main() -> None:
         started = RunConfig("ev-splat", recipe, str(source.resolve()), asked.seed)
         options = Options(steps=asked.steps)
         start(started, capture, run, options, device="cpu", console=Console())
-        mean = measure(open_run(run, capture=None, device="cpu"), run, Console())["mean"]
+        mean = open_run(run, capture=None, device="cpu").evaluate(console=Console())["mean"]
         rows.append({"camera": name, "psnr": mean["psnr"], "ssim": mean["ssim"]})
         save("optics", rows, {"steps": str(asked.steps), "size": asked.size})
     show(rows)

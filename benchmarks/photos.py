@@ -20,7 +20,8 @@ from sharpfield.evaluation.evaluate import Measuring, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.training.plan import Options
 
 REFINED = Refinement(steps=200, rate=5e-4, every=50)

@@ -21,7 +21,8 @@ from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import measure, open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.cameras.rigs import ring
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.simulation.simulate_moving import MOVING_RIG, simulate_moving
@@ -66,7 +67,7 @@ def round_of(name: str, minutes: float, capture: Path, run: Path, device: str) -
     recipe = prepared(name, "draft", capture=seen, device=device)
     started = RunConfig(name, recipe, str(capture.resolve()), 0, use=race.use)
     start(started, seen, run, Options(minutes=minutes), device=device, console=console)
-    mean = measure(open_run(run, device=device), run, console)["mean"]
+    mean = open_run(run, device=device).evaluate(console=console)["mean"]
     trained = json.loads((run / "training.json").read_text())
     return {
         "minutes": minutes,

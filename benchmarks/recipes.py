@@ -23,7 +23,8 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import measure, open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.plan import Options
@@ -123,7 +124,7 @@ def _compete(
     start(started, native.read(source), run, options, device=asked.device, console=console)
     opened = open_run(run, capture=None, device=asked.device)
     opened = replace(opened, capture=native.read(folders["stored"]))
-    metrics = measure(opened, run, console)
+    metrics = opened.evaluate(console=console)
     trained = json.loads((run / "training.json").read_text())
     return {
         "recipe": contender.name,

@@ -26,7 +26,8 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import measure, open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.plan import Options
@@ -116,7 +117,7 @@ def main() -> None:
         started = RunConfig("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
         start(started, capture, run, options, device="cpu", console=console)
         opened = open_run(run, capture=None, device="cpu")
-        metrics = measure(opened, run, console)
+        metrics = opened.evaluate(console=console)
         rows.append({"poses": name, **_row(opened.model, metrics, truth, thresholds)})
     show(rows)
     length = f"{asked.steps} steps" if asked.steps else f"{asked.minutes} minutes"

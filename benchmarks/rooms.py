@@ -21,10 +21,10 @@ from sharpfield.captures.read import read
 from sharpfield.cli.arguments import parse_size
 from sharpfield.cli.runs import changed
 from sharpfield.core.capture import Capture
-from sharpfield.evaluation.evaluate import Measuring
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import measure, open_run, start
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.simulate_room import ROOM_RIG, RoomTiming, simulate_room
 from sharpfield.training.plan import Options
 
@@ -113,7 +113,7 @@ def _compete(
     options = Options(steps=asked.steps) if asked.steps else Options(minutes=asked.minutes)
     start(started, capture, run, options, device=asked.device, console=console)
     opened = open_run(run, device=asked.device)
-    metrics = measure(opened, run, console, measuring=Measuring(train_views=1))
+    metrics = opened.evaluate(train_views=1, console=console)
     trained = json.loads((run / "training.json").read_text())
     return {
         "recipe": contender.name,

@@ -5,20 +5,33 @@ lists of options are longer than elsewhere, so that `help(sf.train)` shows all t
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from sharpfield.captures.read import read as read_capture
+from sharpfield.captures.read import read_unposed
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
+from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur_to
+from sharpfield.preparation.deblur import deblur as deblur_capture
 from sharpfield.recipes import recipe_named
-from sharpfield.recipes.presets import prepared
+from sharpfield.recipes.choose import prepared
+from sharpfield.recordings.open import open_recording
+from sharpfield.runs.captures import LayoutName, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named, with_options
 from sharpfield.runs.run import Run, open_run
 from sharpfield.runs.start import start
+from sharpfield.simulation.by_name import (
+    RecordingOptions,
+    RigOptions,
+    RoomOptions,
+    TimingOptions,
+    simulate_named,
+)
 from sharpfield.training.plan import Options
 
-__all__ = ["open_run", "read", "train"]
+__all__ = ["deblur", "open_recording", "open_run", "read", "simulate", "train", "write"]
 
 
 def read(
@@ -31,6 +44,7 @@ def read(
     hold_out: str | None = None,
     threshold: float | None = None,
     trust_pickle: bool = False,
+    poses: bool = True,
 ) -> Capture:
     """Read a capture from a folder.
 
@@ -48,11 +62,21 @@ def read(
             better.
         trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
             are built from them, and anything else is refused.
+        poses: Whether its poses must be known; `deblur` needs none.
 
     Raises:
         CaptureError: The capture cannot be read, or its poses are not known yet.
         OptionError: An option does not fit the layout.
     """
+    if not poses:
+        return read_unposed(
+            path,
+            layout=layout,
+            event_unit=event_unit,
+            missing=missing,
+            threshold=threshold,
+            trust_pickle=trust_pickle,
+        )
     return read_capture(
         path,
         layout=layout,
@@ -65,12 +89,128 @@ def read(
     )
 
 
+def simulate(
+    scene: str = "garden",
+    *,
+    size: tuple[int, int] | None = None,
+    frames: int | None = None,
+    seed: int = 0,
+    out: Path | str | None = None,
+    layout: LayoutName = "native",
+    motion: str = "glide",
+    sensor: str = "ideal",
+    threshold: float | None = None,
+    colour: bool = False,
+    rolling_shutter_ms: float = 0.0,
+    lens: Literal["pinhole", "brown", "fisheye"] = "pinhole",
+    distortion: tuple[float, ...] = (),
+    exposure_us: int | None = None,
+    interval_us: int | None = None,
+    step_us: int | None = None,
+    most_change: float | None = None,
+    test_every: int | None = None,
+    rig: Literal["ring", "hand"] = "ring",
+    views: int = 8,
+    held_out: int = 4,
+    blurry: float = 0.75,
+    blur: Literal["motion", "published"] = "motion",
+    events: bool = False,
+    depth_noise: float = 0.0,
+    drift: float = 0.0,
+) -> Capture:
+    """Record a closed-form scene with simulated cameras: frames, events, poses, sharp truth.
+
+    Args:
+        scene: One that stands still (garden, shelf, tiles, mobile), one that moves before a rig of
+            cameras (spinner, arm, jelly, glider, puppet), or room, which is walked through with a
+            depth camera.
+        size: Width and height of the sensor in px; by default (240, 160), (64, 64) for a scene
+            that moves, (240, 180) for the room.
+        frames: Of each camera; by default 18 (33 where the scene moves, 200 in the room).
+        seed: Random seed of the camera path and of all noise.
+        out: Folder to write the capture to; by default it exists only in memory.
+        layout: Files to write: native, ev-deblur-nerf, evdnerf, scannet.
+        motion: Of the camera: glide, shaky.
+        sensor: Of the events: ideal, dvs346, gen3-vga, gen4-hd.
+        threshold: Contrast threshold of both signs, natural log, instead of the sensor's own.
+        colour: Whether events come from behind a Bayer filter, and frames are linear.
+        rolling_shutter_ms: From the exposure of the first row to that of the last.
+        lens: Model of the lens.
+        distortion: Its coefficients, as OpenCV's: k1 k2 p1 p2 k3, or k1 k2 k3 k4 of a fisheye.
+        exposure_us: Length of an exposure; 0 for sharp frames.
+        interval_us: From the start of one exposure to that of the next.
+        step_us: Between two images of the scene, whose mean is a blurred frame.
+        most_change: Largest change of log intensity between two such images, which are placed
+            closer where it is exceeded; 0 for even steps.
+        test_every: Every how many frames one is sharp and held out; 0 for none.
+        rig: Cameras before a moving scene: a ring of still ones, or one in a hand.
+        views: Cameras on the ring.
+        held_out: Further cameras, for testing.
+        blurry: Share of the room's training frames that is blurred.
+        blur: In the room: by the walk's motion, or each image by a random kernel, as published.
+        events: Whether an event camera walks along through the room; other scenes have one.
+        depth_noise: Standard deviation in metres of the room's depth at one metre.
+        drift: Metres by which the room's poses stray from the true ones.
+
+    Raises:
+        OptionError: A name is unknown, or an option does not fit the scene.
+    """
+    room = RoomOptions(blurry, blur, events, depth_noise, drift)
+    made = simulate_named(
+        scene,
+        size=size,
+        layout=layout,
+        recording=RecordingOptions(
+            motion, sensor, threshold, colour, rolling_shutter_ms, lens, distortion, room
+        ),
+        rig=RigOptions(rig, views, held_out),
+        timing=TimingOptions(frames, exposure_us, interval_us, step_us, most_change, test_every),
+        seed=seed,
+    )
+    if out is not None:
+        made = replace(made, name=Path(out).name)
+        write(made, out, layout)
+    return made
+
+
+def deblur(
+    capture: Capture,
+    *,
+    threshold: float | Literal["known", "find"] = "known",
+    method: Literal["exact", "joint", "published"] = "exact",
+    instants: int = 1,
+    out: Path | str | None = None,
+) -> Deblurred:
+    """Sharp images of the blurred frames by the event double integral; nothing is trained.
+
+    Args:
+        capture: With frames and events; its poses are not used.
+        threshold: Contrast threshold of both signs, natural log; or "known" for what the capture
+            says, "find" to estimate it.
+        method: "exact" integrates in linear light, from event to event; "joint" makes all frames
+            agree with the events between them, too; "published" is Ev-DeblurNeRF's.
+        instants: Images of each exposure, evenly spread; more than one only for "exact".
+        out: Folder for the images, a contact sheet and `deblur.json`.
+
+    Returns:
+        The images as the frames are stored, [n, instants, h, w, c], with their frames and times.
+
+    Raises:
+        CaptureError: Frames or events are missing, or no frame is blurred.
+        OptionError: The method does not give several images.
+    """
+    options = DeblurOptions(threshold, method, instants)
+    return (
+        deblur_capture(capture, options) if out is None else deblur_to(capture, Path(out), options)
+    )
+
+
 def train(
     recipe: str,
     capture: Capture | Path | str,
     *,
     out: Path | str,
-    minutes: float | None = None,
+    minutes: float | int | None = None,
     steps: int | None = None,
     preset: str = "",
     options: Mapping[str, Any] | None = None,
@@ -117,11 +257,12 @@ def train(
             got=type(capture).__name__,
             do="give the folder of one, or what sf.read or sf.simulate return",
         )
-    kind, where = recipe_named(recipe), device_named(device)
+    recipe_named(recipe)  # before anything is read
+    where = device_named(device)
     length = Options(steps=steps, minutes=minutes, resume=resume, memory_gb=memory_gb)
     in_memory = isinstance(capture, Capture)
     source = capture if in_memory else read_capture(capture)
-    made = prepared(recipe, kind(), preset, capture=source, device=where)
+    made = prepared(recipe, preset, capture=source, device=where)
     config = RunConfig(
         recipe,
         with_options(made, options or {}),

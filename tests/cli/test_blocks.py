@@ -45,7 +45,7 @@ def test_blocks_become_one_run_of_what_lies_in_each(alone: Path):
     whole = open_run(alone)
     found = len(whole.model.scene.gaussians)
     assert 0 < found < sum(len(part.scene.gaussians) for part in parts)
-    assert whole.started.block == "" and len(whole.capture.split.train) == 32
+    assert whole.config.block == "" and len(whole.capture.split.train) == 32
     assert read_ledger(alone).finished
 
 

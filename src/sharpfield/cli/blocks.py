@@ -16,8 +16,15 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.splats.merge import merge
-from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
-from sharpfield.runs.run import ReadOptions, device_named, open_run, start
+from sharpfield.runs.config import (
+    ReadOptions,
+    RunConfig,
+    device_named,
+    read_run_config,
+    write_run_config,
+)
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
 from sharpfield.training.optim import adam
 from sharpfield.training.plan import Options

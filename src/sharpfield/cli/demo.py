@@ -14,8 +14,9 @@ from sharpfield.core.frames import Exposure, Frames
 from sharpfield.preparation.deblur import DeblurOptions, deblur
 from sharpfield.recipes.choose import prepared
 from sharpfield.report.tables import markdown, methods_table
-from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import device_named, measure, open_run, start
+from sharpfield.runs.config import RunConfig, device_named
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.simulate import Rig, Timing, simulate
 from sharpfield.training.plan import Options
@@ -115,4 +116,4 @@ def _compete(
     opened = open_run(run, capture=None, device=where)
     opened = replace(opened, capture=native.read(out / "capture"))
     title = TITLE if contender is OURS else f"Baseline: {contender.name}"
-    return measure(opened, run, console, baselines=baselines, title=title)
+    return opened.evaluate(baselines=baselines, title=title, console=console)

@@ -15,7 +15,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.report.event_frames import windows
-from sharpfield.runs.run import OpenedRun, open_run
+from sharpfield.runs.run import Run, open_run
 from sharpfield.simulation.sensors.event_pixels import SENSORS, SIZES, EventSensor
 from sharpfield.storage.event_formats import expect_format
 from sharpfield.twin.match import match
@@ -189,7 +189,7 @@ def _parts(twin: EventTwin, start_us: int, edges: list[int], tell: Tell) -> Iter
         tell(edge)
 
 
-def _seat(opened: OpenedRun, place: Place, sensor: str) -> Viewpoint:
+def _seat(opened: Run, place: Place, sensor: str) -> Viewpoint:
     """Where to look from, as long as the camera's path lasts."""
     if place.trajectory is not None:
         seat = on_path(opened.model, *read_poses(place.trajectory))
@@ -230,7 +230,7 @@ def _whole_steps(span_us: tuple[int, int], last_us: int, pace: Pace) -> tuple[in
 
 
 def _matched(
-    console: Console, opened: OpenedRun, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
+    console: Console, opened: Run, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
 ) -> EventSensor:
     """The sensor with thresholds that fit the scene; says what was found."""
     found = match(

@@ -9,7 +9,7 @@ from sharpfield.cli.arguments import screen
 from sharpfield.core.errors import OptionError
 from sharpfield.fields.gaussians.export import export_splats
 from sharpfield.recipes.splats.model import SplatModel
-from sharpfield.runs.run import OpenedRun, open_run
+from sharpfield.runs.run import Run, open_run
 
 ENDING = ".ply"
 
@@ -41,17 +41,17 @@ def export(
         out,
         encoding=encoding or model.encoding,
         change=model.change.inverse(),
-        comments=(f"sharpfield {opened.started.name}", *antialiased),
+        comments=(f"sharpfield {opened.config.name}", *antialiased),
     )
     screen().print(f"{len(scene.gaussians):,} Gaussians are in {out}")
 
 
-def _with_gaussians(opened: OpenedRun, run: Path) -> SplatModel:
+def _with_gaussians(opened: Run, run: Path) -> SplatModel:
     if not isinstance(opened.model, SplatModel):
         raise OptionError(
             "this run holds no Gaussians",
             where=run,
-            got=f"the recipe {opened.started.name}",
+            got=f"the recipe {opened.config.name}",
             do="export a run of one of the splat recipes; `sharpfield recipes` lists them",
         )
     return opened.model

@@ -14,16 +14,16 @@ from tyro.conf import Positional
 from sharpfield.captures.read import read
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.core.errors import OptionError
-from sharpfield.evaluation.evaluate import Measuring
 from sharpfield.evaluation.paths import camera_path
-from sharpfield.evaluation.refine import Refinement, refine_poses
+from sharpfield.evaluation.refine import Refinement
 from sharpfield.evaluation.report import flat
 from sharpfield.metrics.lpips import load_lpips
 from sharpfield.recipes.choose import prepared
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.video import write_video
-from sharpfield.runs.config import RunConfig
-from sharpfield.runs.run import ReadOptions, device_named, measure, open_run, start
+from sharpfield.runs.config import ReadOptions, RunConfig, device_named
+from sharpfield.runs.run import open_run
+from sharpfield.runs.start import start
 from sharpfield.training.plan import Options
 
 EIGHT_BIT = 255
@@ -75,8 +75,8 @@ def train(
     made = changed(made, choice.change)
     where_from, given = str(capture.resolve()), reading.given()
     started = RunConfig(recipe, made, where_from, seed, choice.use, given, choice.block)
-    ledger = start(started, source, out, options, device=where, console=console)
-    if ledger.finished:
+    trained = start(started, source, out, options, device=where, console=console)
+    if trained.ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")
 
 
@@ -107,13 +107,12 @@ def evaluate(
     lpips = None
     if lpips_backbone is not None and lpips_linear is not None:
         lpips = load_lpips(lpips_backbone, lpips_linear)
-    volume = getattr(opened.started.recipe, "volume", None)
-    poses, stated = {}, {"near_plane_removal": getattr(volume, "clear_before", 0.0)}
-    if refine:
-        found = refine_poses(opened.model, opened.capture, how=refinement)
-        poses, stated = found.poses, {**stated, **found.protocol}
-    measuring = Measuring(train_views=train_views, lpips=lpips, poses=poses, stated=stated)
-    metrics = measure(opened, run, console, measuring=measuring)
+    metrics = opened.evaluate(
+        refine=refinement if refine else None,
+        train_views=train_views,
+        lpips=lpips,
+        console=console,
+    )
     mean = {name: value for name, value in metrics["mean"].items() if value is not None}
     console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()))
     console.print(f"The report is {run / 'report.html'}")

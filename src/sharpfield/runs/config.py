@@ -4,7 +4,6 @@ And what follows from it: which part and which streams of the capture are used, 
 """
 
 import dataclasses
-import difflib
 import json
 import types
 import typing
@@ -18,7 +17,7 @@ import torch
 from sharpfield.captures.blocks import blocks_of, limited, parsed
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError, OptionError, RunError
+from sharpfield.core.errors import CaptureError, OptionError, RunError, did_you_mean
 from sharpfield.core.files import write_json
 from sharpfield.recipes import recipe_named
 
@@ -182,24 +181,25 @@ def with_options(recipe: Any, options: Mapping[str, Any]) -> Any:
 
 def _with_option(part: Any, name: str, path: list[str], value: Any) -> Any:
     first, *rest = path
-    known = {f.name for f in dataclasses.fields(part)} if dataclasses.is_dataclass(part) else set()
+    fields = dataclasses.fields(part) if dataclasses.is_dataclass(part) else ()
+    known = [f.name for f in fields]
     if first not in known:
-        close = difflib.get_close_matches(first, known, n=1)
         raise OptionError(
             f"unknown option {name!r}",
             where=type(part).__name__,
-            do=f"did you mean {close[0]!r}?" if close else f"use one of {', '.join(sorted(known))}",
+            do=did_you_mean(first, known),
         )
-    if rest:
-        return replace(part, **{first: _with_option(getattr(part, first), name, rest, value)})
     hint = typing.get_type_hints(type(part))[first]
-    if not _fits(value, hint):
+    if rest:
+        value = _with_option(getattr(part, first), name, rest, value)
+    elif not _fits(value, hint):
         raise OptionError(
             f"the option {name!r} takes another type of value",
             got=repr(value),
             do=f"give {getattr(hint, '__name__', hint)}, such as {getattr(part, first)!r}",
         )
-    return replace(part, **{first: tuple(value) if isinstance(value, list) else value})
+    changes = {first: tuple(value) if isinstance(value, list) else value}
+    return replace(typing.cast(Any, part), **changes)
 
 
 def _fits(value: Any, hint: Any) -> bool:

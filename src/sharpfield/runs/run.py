@@ -64,8 +64,8 @@ class Run:
         self,
         at: At = None,
         *,
-        time: float | None = None,
-        exposure: float | bool = False,
+        time: float | int | None = None,
+        exposure: float | int | bool = False,
         samples: int = 16,
     ) -> Float32[np.ndarray, "h w 3"]:
         """An image as the frames would store it, 0...1: sharp, or blurred by an exposure.
@@ -88,7 +88,9 @@ class Run:
         light = mean_light(self.model, self.capture, camera, samples)
         return encoded(self.model, light)
 
-    def depth(self, at: At = None, *, time: float | None = None) -> Float32[np.ndarray, "h w"]:
+    def depth(
+        self, at: At = None, *, time: float | int | None = None
+    ) -> Float32[np.ndarray, "h w"]:
         """Expected depth along the camera's axis, in units of the capture's world.
 
         Args:

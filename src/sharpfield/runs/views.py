@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
@@ -21,7 +21,7 @@ from sharpfield.geometry.rolling import Rolling
 from sharpfield.geometry.trajectory import count_tracks
 from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
 
-At = int | Float[np.ndarray, "3 4"] | Float[np.ndarray, "4 4"] | None
+At = int | Shaped[np.ndarray, "a 4"] | Shaped[Tensor, "a 4"] | None
 """A frame by number; a pose; or None for the camera of the first track."""
 
 TINY_OPACITY = 1e-3
@@ -42,7 +42,7 @@ class Viewpoint:
     """In the model's world; None to follow the track."""
 
 
-def viewpoint(model: Any, capture: Capture, at: Any, time: float | None) -> Viewpoint:
+def viewpoint(model: Any, capture: Capture, at: Any, time: float | int | None) -> Viewpoint:
     """The camera that `at` and `time` ask for.
 
     Args:
@@ -64,9 +64,9 @@ def viewpoint(model: Any, capture: Capture, at: Any, time: float | None) -> View
             got=f"{time} us",
             do=f"use {clock.origin_us} to {clock.origin_us + clock.span_us} us",
         )
-    middle = clock.origin_us + clock.span_us / 2
+    when = clock.origin_us + clock.span_us / 2 if time is None else float(time)
     if at is None:
-        return Viewpoint(middle if time is None else time)
+        return Viewpoint(when)
     if isinstance(at, int | np.integer) and not isinstance(at, bool):
         frames = capture.needed_frames
         if not 0 <= at < len(frames):
@@ -76,10 +76,11 @@ def viewpoint(model: Any, capture: Capture, at: Any, time: float | None) -> View
         exposure = frames.exposure
         own = float(exposure.middle_us[at])
         duration = float(exposure.duration_us[at])
-        return Viewpoint(own if time is None else time, duration, int(frames.track[at]))
+        when = own if time is None else when
+        return Viewpoint(when, duration, int(frames.track[at]))
     pose = change_of(model.capture).poses(as_pose(at))
     held = torch.from_numpy(pose).float().to(device_of(model))
-    return Viewpoint(middle if time is None else time, pose=held)
+    return Viewpoint(when, pose=held)
 
 
 def as_pose(values: Any) -> Float[np.ndarray, "3 4"]:
@@ -156,9 +157,7 @@ def encoded(model: Any, light: Float[Tensor, "h w c"]) -> Float[np.ndarray, "h w
     return stored.expand(-1, -1, 3).contiguous().numpy()
 
 
-def depth_along_axis(
-    model: Any, capture: Capture, camera: Viewpoint
-) -> Float[np.ndarray, "h w"]:
+def depth_along_axis(model: Any, capture: Capture, camera: Viewpoint) -> Float[np.ndarray, "h w"]:
     """Depth along the camera's axis, in units of the capture's world."""
     seen, own = radiance(model, capture, camera), model.capture
     depth = seen.depth

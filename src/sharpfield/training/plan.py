@@ -28,7 +28,7 @@ class Options:
 
     steps: int | None = None
     """Length of the run; None for what the recipe says, or what `minutes` allow."""
-    minutes: float | None = None
+    minutes: float | int | None = None
     """Time for this session. A new run gets a schedule that fits into it."""
     resume: bool = False
     """Go on with the run in the folder, if there is one."""
