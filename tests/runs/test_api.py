@@ -148,7 +148,7 @@ def test_options_are_changed_by_name(capture: sf.Capture, tmp_path: Path) -> Non
         (lambda run: sf.simulate("gardn"), "(?s)unknown scene.*garden"),
         (lambda run: sf.simulate(size=(5, 5)), "not the size of a sensor"),
         (lambda run: sf.write(run.capture, "x", "colmapp"), "unknown layout to write"),
-        (lambda run: changed(run, {"gausians.degree": 1}), "did you mean 'gaussians'"),
+        (lambda run: changed(run, {"gausians.degree": 1}), "did you mean gaussians"),
         (lambda run: changed(run, {"gaussians.degree": "1"}), "(?s)type of value.*give int"),
     ],
 )
