@@ -61,12 +61,11 @@ def spoiled(truth: Capture, seed: int) -> Capture:
         length = np.sqrt((error[:, axes] ** 2).sum(-1).mean())
         error[:, axes] *= most / length
     poses = se3.compose(torch.from_numpy(path.poses), se3.exp(torch.from_numpy(error))).numpy()
-    notes = {k: v for k, v in truth.notes.items() if not k.startswith("threshold")}
     return replace(
         truth,
         trajectory=Stamped(path.times_us, poses, truth.clock),
         events=replace(events, t_us=events.t_us + LATE_US),
-        notes=notes,
+        known=replace(truth.known, thresholds=None),
         name="spoiled",
     )
 

@@ -15,6 +15,7 @@ import tyro
 from sharpfield import core
 from sharpfield.captures.native.layout import write
 from sharpfield.captures.summary import summary
+from sharpfield.core.capture import Known, Thresholds
 from sharpfield.geometry.trajectory import Stamped
 
 
@@ -48,7 +49,7 @@ def main(size: tuple[int, int] = (64, 48), out: Path = Path("your_capture")) -> 
         frames=frames,
         events=core.EventStream(x, y, t_us, p, width, height),
         split=core.Split(train=np.array([0, 1, 2]), test=np.array([3])),
-        notes={"threshold_on": 0.25, "threshold_off": 0.25},
+        known=Known(thresholds=Thresholds(negative=0.25, positive=0.25)),
     )
     write(capture, out)
     print(summary(out)["events"])

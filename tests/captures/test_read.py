@@ -12,7 +12,7 @@ def test_a_capture_is_recognised_by_its_files(panning, tmp_path):
     write_llff_events.write(panning, tmp_path / "b")
     assert layout_of(tmp_path / "a") == "native"
     assert layout_of(tmp_path / "b") == "ev-deblur-nerf"
-    assert read(tmp_path / "a").name == "panning"
+    assert read(tmp_path / "a").name == panning.name
     assert read(str(tmp_path / "b")).name == "b"
 
 

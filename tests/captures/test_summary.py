@@ -8,6 +8,7 @@ import pytest
 from sharpfield.captures.native.layout import write
 from sharpfield.captures.summary import capture_summary, summary
 from sharpfield.captures.writers import llff_events as write_llff_events
+from sharpfield.core.capture import Known
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.event_writer import write_events
 
@@ -25,7 +26,7 @@ def write_flat(path, events, factor=1):
 def test_a_capture(panning, tmp_path):
     write(panning, tmp_path / "panning")
     about = summary(tmp_path / "panning")
-    assert about["kind"] == "capture" and about["name"] == "panning"
+    assert about["kind"] == "capture" and about["name"] == panning.name
     events, frames = about["events"], about["frames"]
     assert events["count"] == 5_000
     assert events["on"] + events["off"] == 5_000
@@ -59,7 +60,7 @@ def test_everything_is_plain_json(panning, tmp_path):
 
 
 def test_photos_of_unknown_motion_are_neither_blurry_nor_sharp(panning):
-    frames = capture_summary(replace(panning, notes={"motion": "unknown"}))["frames"]
+    frames = capture_summary(replace(panning, known=Known(motion="unknown")))["frames"]
     assert frames["count"] == 9 and frames["blurry"] is None and frames["sharp"] is None
 
 

@@ -35,7 +35,7 @@ def test_a_room_in_the_layout_of_scannet(tmp_path):
     capture = read(room)
     assert capture.source == "scannet" and capture.frames.encoding == "srgb"
     np.testing.assert_array_equal(capture.split.train, [0, 5])
-    assert (capture.notes["blur_px"] > 0).tolist() == [True, *[False] * 4, True, False]
+    assert (capture.frames.blur_px > 0).tolist() == [True, *[False] * 4, True, False]
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,14 @@
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+import sharpfield
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
@@ -59,12 +62,38 @@ def capture(**change: Any) -> Capture:
     return Capture(**{**given, **change})
 
 
-def test_thresholds_are_noted_for_all_pixels_or_for_each():
-    notes = {"threshold_on": 0.25, "threshold_off": np.array([[0.1, 0.3], [0.2, 0.9]])}
-    made = capture(notes=notes)
-    assert made.threshold("on") == 0.25
-    assert made.threshold("off") == pytest.approx(0.25)
-    assert capture().threshold("on") is None
+def test_what_is_unknown_is_listed():
+    assert capture().known == Known() and not capture().known.unknown
+    made = Known(poses="unknown", bounds="unknown", intrinsics="estimated")
+    assert made.unknown == ("poses", "bounds")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"log_floor": float("nan")},
+            "CaptureError: `log_floor` must be a finite number, not negative\n  got    nan",
+        ),
+        (
+            {"thresholds": Thresholds(0.2, -0.2)},
+            "CaptureError: `threshold_positive` must be a finite number, not negative\n"
+            "  got    -0.2",
+        ),
+    ],
+)
+def test_impossible_knowledge_is_refused(change: dict, message: str):
+    with pytest.raises(CaptureError) as refused:
+        Known(**change)
+    assert str(refused.value) == message
+
+
+def test_no_code_branches_on_the_notes_of_a_capture():
+    sources = Path(sharpfield.__file__).parent.rglob("*.py")
+    branching = re.compile(r"\b(?!recording)\w+\.notes(\.get\(|\[)")
+    found = [(path.name, line) for path in sources for line in path.read_text().splitlines()
+             if branching.search(line)]  # fmt: skip
+    assert [name for name, _ in found if name != "simulate_moving.py"] == []
 
 
 def test_a_clock_there_and_back():

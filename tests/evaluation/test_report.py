@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core.capture import Split
+from sharpfield.core.capture import Known, Split
 from sharpfield.core.events import merged
 from sharpfield.core.paper import Paper
 from sharpfield.evaluation import report
@@ -116,7 +116,7 @@ def test_frames_are_called_blurry_only_if_they_may_be():
     sharp = replace(capture(), split=Split(np.array([0, 4]), np.array([1])))
     assert input_name(capture()) == "blurry input"
     assert input_name(sharp) == "input"
-    assert input_name(replace(sharp, notes={"motion": "unknown"})) == "blurry input"
+    assert input_name(replace(sharp, known=Known(motion="unknown"))) == "blurry input"
 
 
 def test_a_gain_over_the_blurry_input_is_told_only_where_it_is_blurry(tmp_path: Path):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.capture import Capture, Clock, Known
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry import se3
@@ -104,7 +104,7 @@ def test_frames_stand_for_a_capture():
 
 
 def test_or_its_trajectory_does_where_the_source_says_so():
-    made = capture(notes={"reference_poses": "trajectory"})
+    made = capture(known=Known(reference_poses="trajectory"))
     np.testing.assert_array_equal(reference_poses(made), made.trajectory.poses)
     np.testing.assert_array_equal(reference_poses(capture(frames=False)), made.trajectory.poses)
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.frames import DepthMaps, Exposure, Frames
 from sharpfield.core.tone import tone_of
 from sharpfield.geometry.trajectory import Still
@@ -36,7 +36,7 @@ def wall(maps: Camera = CAMERA) -> Capture:
         frames=Frames(images, Exposure(at, at), np.arange(3), ("a", "b", "c")),
         depth=DepthMaps(stored, maps),
         split=Split(np.array([0, 2]), np.array([1])),
-        notes={"motion": "unknown"},
+        known=Known(motion="unknown"),
     )
 
 

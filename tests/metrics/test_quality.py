@@ -128,13 +128,13 @@ def by_events(walked):
 
 
 def test_scores_rank_frames_by_their_true_blur(walked, by_depth, by_events):
-    true = walked.notes["blur_px"][walked.split.train]
+    true = walked.frames.blur_px[walked.split.train]
     assert rank_correlation(by_depth.scores, -true) > 0.9
     assert rank_correlation(by_events.scores, -true) > 0.95
 
 
 def test_events_measure_blur_in_pixels(walked):
-    true = walked.notes["blur_px"][walked.split.train]
+    true = walked.frames.blur_px[walked.split.train]
     found = event_blur(walked)
     assert np.median(np.abs(found - true) / (true + 0.3)) < 0.25
     assert event_blur(walked, frames=walked.split.test).max() < 0.5, "instants have no blur"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure
@@ -59,9 +59,7 @@ def test_light_is_where_the_integral_holds() -> None:
 
 
 def test_known_thresholds_are_used_and_others_found() -> None:
-    noted = replace(
-        capture(), notes={"threshold_off": np.array([0.1, 0.3, 0.9]), "threshold_on": 0.4}
-    )
+    noted = replace(capture(), known=Known(thresholds=Thresholds(0.3, 0.4)))
     known = deblur(noted, DeblurOptions()).found
     assert (known.thresholds.negative, known.thresholds.positive, known.judge) == (
         0.3,
@@ -70,7 +68,7 @@ def test_known_thresholds_are_used_and_others_found() -> None:
     )
     given = deblur(noted, DeblurOptions(threshold=0.17)).found
     assert (given.thresholds.negative, given.judge) == (0.17, "given")
-    silent = deblur(replace(capture(), notes={}), DeblurOptions()).found
+    silent = deblur(replace(capture(), known=Known()), DeblurOptions()).found
     assert silent.judge == "disagreement"
     assert silent.thresholds.negative == pytest.approx(THRESHOLD, rel=0.15)
     assert silent.thresholds.positive == pytest.approx(THRESHOLD, rel=0.15)

@@ -40,8 +40,8 @@ def fast() -> Capture:
 
 
 def unposed(capture: Capture) -> Capture:
-    notes = capture.notes | {native.POSES: native.UNKNOWN, native.BOUNDS: native.UNKNOWN}
-    return replace(capture, trajectory=Still(np.eye(3, 4)[None]), notes=notes)
+    known = replace(capture.known, poses="unknown", bounds="unknown")
+    return replace(capture, trajectory=Still(np.eye(3, 4)[None]), known=known)
 
 
 @lru_cache
@@ -92,7 +92,7 @@ def test_scale_bounds_and_points_go_together() -> None:
     toward = made.points - poses[3, :, 3]
     depth = toward @ poses[3, :, 2]
     assert 0.5 < np.median(depth) < 2 and made.near < np.median(depth) < made.far
-    assert native.POSES not in made.notes
+    assert made.known.poses == made.known.bounds == "known"
 
 
 def test_the_capture_survives_the_disk_and_the_report_says_what_happened(tmp_path: Path) -> None:

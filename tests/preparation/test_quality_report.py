@@ -36,7 +36,7 @@ def test_what_is_written_is_what_is_said(walked, tmp_path):
 
 
 def test_without_truth_nothing_is_said_about_it(walked):
-    blind = replace(walked, notes={}, depth=None)
+    blind = replace(walked, frames=replace(walked.frames, blur_px=None), depth=None)
     found, told_by = judged(blind, QualityOptions(every_frame=True))
     table = as_table(blind, found, told_by)
     assert told_by == "flow" and len(table["frames"]) == 9

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import Capture, Known
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.measurements import Instants, Pixels
 from sharpfield.core.protocols import Growing, Model
@@ -63,7 +63,7 @@ def photos() -> Capture:
             track=np.arange(len(frames)),
             exposure=type(frames.exposure)(middle, middle),
         ),
-        notes={"motion": "unknown"},
+        known=Known(motion="unknown"),
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.core.capture import Split
+from sharpfield.core.capture import Known, Split
 from sharpfield.geometry.trajectory import Still
 from sharpfield.report.figures import curves_figure, read_log, timeline_figure, trajectory_figure
 from tests.evaluation.fake import capture
@@ -20,7 +20,7 @@ def still_photos():
         whole,
         frames=replace(frames, track=np.arange(6)),
         trajectory=Still(poses),
-        notes={"motion": "unknown"},
+        known=Known(motion="unknown"),
     )
 
 

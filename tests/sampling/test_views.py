@@ -292,7 +292,7 @@ def test_sharp_images_follow_what_is_believed(tiny: Capture):
 
 
 def test_photos_of_unknown_motion_have_no_sharp_images(tiny: Capture):
-    unknown = replace(tiny, notes={**tiny.notes, "motion": "unknown"})
+    unknown = replace(tiny, known=replace(tiny.known, motion="unknown"))
     assert looks(tiny).sharp is not None and looks(unknown).sharp is None
 
 

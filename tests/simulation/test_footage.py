@@ -36,7 +36,7 @@ def test_a_folder_becomes_frames_and_events(folder):
     change = np.log((light[-1] + 1e-5) / (light[0] + 1e-5))[0, :, 0]
     counts = np.bincount(events.x, minlength=4)
     np.testing.assert_array_equal(counts, 6 * np.floor(change / 0.1).astype(int))
-    assert capture.notes["poses"] == "unknown" and set(events.p) == {1}
+    assert capture.known.unknown == ("poses", "intrinsics", "bounds") and set(events.p) == {1}
 
 
 def test_given_times_are_kept(folder):

@@ -32,7 +32,7 @@ def test_a_capture_is_whole(capture):
     assert len(events) > 10_000
     known = capture.trajectory.known_us(0)
     assert known[0] <= events.t_us[0] and events.t_us[-1] <= known[1]
-    assert capture.notes["threshold_on"] == 0.2
+    assert capture.known.thresholds.positive == 0.2
     assert capture.notes["threshold_on_map"].shape == (32, 48)
 
 

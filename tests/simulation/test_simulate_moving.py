@@ -61,7 +61,7 @@ def test_a_rig_is_whole(capture):
         checked(stream, "simulation")
         np.testing.assert_array_equal(np.unique(stream.track), tracks)
         assert len(stream) > 1000
-    assert capture.notes["threshold_on"] == 0.2 and "threshold_on_map" not in capture.notes
+    assert capture.known.thresholds.positive == 0.2 and "threshold_on_map" not in capture.notes
 
 
 def test_truth_is_the_view_of_each_camera(capture):

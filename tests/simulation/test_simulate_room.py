@@ -26,7 +26,7 @@ def walked() -> Capture:
 
 
 def test_the_wanted_share_is_blurred_and_held_out_frames_are_sharp(walked):
-    blur, split = walked.notes["blur_px"], walked.split
+    blur, split = walked.frames.blur_px, walked.split
     share = (blur[split.train] >= BLURRY_OF_WIDTH * 64 * 0.99).mean()
     assert share == pytest.approx(0.75, abs=0.05)
     np.testing.assert_array_equal(split.test, [0, 8, 16])
@@ -37,7 +37,7 @@ def test_the_wanted_share_is_blurred_and_held_out_frames_are_sharp(walked):
 
 def test_frames_are_the_mean_of_light_while_the_shutter_is_open(walked):
     """The blurriest frame, against many images of its exposure."""
-    frame = int(np.argmax(walked.notes["blur_px"]))
+    frame = int(np.argmax(walked.frames.blur_px))
     times = np.linspace(*walked.frames.exposure.window(frame), 60).round().astype(np.int64)
     path, place = walk(walked.clock.span_us, 1), room()
     light = np.mean([view(place, walked.camera, p)[0] for p in path.poses(times)], 0)
@@ -72,7 +72,7 @@ def test_published_blur_is_the_same_everywhere_and_spares_held_out_frames():
     made = simulate_room(rig=SMALL, timing=timing)
     np.testing.assert_array_equal(made.split.train, [0, 3, 6, 9])
     assert made.frames.exposure.instant.all()
-    assert (made.notes["blur_px"][made.split.train] > 0).all()
+    assert (made.frames.blur_px[made.split.train] > 0).all()
     same = (made.frames.images == made.frames.truth).all((1, 2, 3))
     np.testing.assert_array_equal(same, np.arange(12) % 3 != 0)
 
@@ -81,7 +81,7 @@ def test_an_event_camera_watches_if_asked():
     timing = RoomTiming(frames=6, events=True)
     made = simulate_room(rig=TINY, timing=timing)
     assert made.events is not None and len(made.events) > 1000
-    assert made.notes["threshold_on"] == 0.2
+    assert made.known.thresholds.positive == 0.2
     assert simulate_room(rig=TINY, timing=replace(timing, events=False)).events is None
 
 

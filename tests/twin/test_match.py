@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.capture import Capture, Clock, Known, Thresholds
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.rays import Radiance, Rays
@@ -46,8 +46,8 @@ def recorded(tracks: int = 1) -> Capture:
     seat = on_track(truth, blank, 0)
     sensor = EventSensor(threshold_on=0.25, threshold_off=0.2)
     seen = EventTwin(light_of(truth, seat), seat.span_us, sensor).until(400_001)
-    notes = {"threshold_on": 0.25, "threshold_off": 0.2}
-    return replace(blank, events=seen, notes=notes)
+    known = Known(thresholds=Thresholds(0.2, 0.25))
+    return replace(blank, events=seen, known=known)
 
 
 def test_the_true_scene_needs_no_other_thresholds():

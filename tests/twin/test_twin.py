@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock
+from sharpfield.core.capture import Capture, Clock, Known, Thresholds
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.events import EventStream
 from sharpfield.core.rays import Radiance, Rays, Views
@@ -270,7 +270,8 @@ def test_light_in_one_channel_is_grey():
 
 
 def test_the_sensor_of_a_capture_is_what_it_states():
-    own = replace(sliding(), notes={"threshold_on": 0.31, "refractory_us": 50.0, "log_floor": 1e-3})
+    known = Known(thresholds=Thresholds(0.2, 0.31), refractory_us=50.0, log_floor=1e-3)
+    own = replace(sliding(), known=known)
     sensor = recorded_sensor(own)
     assert (sensor.threshold_on, sensor.threshold_off) == (0.31, EventSensor().threshold_off)
     assert (sensor.refractory_us, sensor.floor, sensor.bayer) == (50.0, 1e-3, "")

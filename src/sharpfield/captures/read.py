@@ -22,9 +22,8 @@ from sharpfield.captures.layouts import (
 )
 from sharpfield.captures.layouts._photos import Missing
 from sharpfield.captures.native import layout as native
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.storage.event_layouts import THRESHOLDS
 
 
 @dataclass(frozen=True)
@@ -202,6 +201,6 @@ def read_unposed(
         )
     capture = LAYOUTS[name].read(folder, **given)
     if threshold is not None:
-        known = dict.fromkeys(THRESHOLDS, threshold)
-        capture = replace(capture, notes=capture.notes | known)
+        known = replace(capture.known, thresholds=Thresholds(threshold, threshold))
+        capture = replace(capture, known=known)
     return capture

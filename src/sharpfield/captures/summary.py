@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Shaped
 
 from sharpfield.captures.layouts import llff_events
+from sharpfield.captures.native.known import known_table
 from sharpfield.captures.read import read_unposed
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -71,7 +72,7 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
         about["test_events"] = stream_summary(capture.test_events)
     if capture.frames is not None:
         about["frames"] = _frames_summary(capture.frames)
-        if capture.notes.get("motion") == "unknown":  # then exposures say nothing about blur
+        if capture.known.motion == "unknown":  # then exposures say nothing about blur
             about["frames"] |= {"blurry": None, "sharp": None}
         about["split"] = {
             "train": len(capture.split.train),
@@ -92,6 +93,7 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
     if capture.depth is not None:
         about["depth"] = _depth_summary(capture.depth)
     about["points"] = 0 if capture.points is None else len(capture.points)
+    about["known"] = known_table(capture.known)
     about["notes"] = {
         key: f"array {note.shape}" if isinstance(note, np.ndarray) else note
         for key, note in capture.notes.items()
@@ -278,5 +280,6 @@ def downscaled(capture: Capture, factor: int) -> Capture:
         truth=None if frames.truth is None else small(frames.truth),
         depth=None,
         flow=None,
+        blur_px=None if frames.blur_px is None else frames.blur_px / factor,
     )
     return replace(capture, camera=camera, frames=smaller)

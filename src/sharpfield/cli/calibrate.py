@@ -8,6 +8,7 @@ from tyro.conf import Positional
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.read import read_unposed
 from sharpfield.cli.arguments import screen
+from sharpfield.core.capture import Thresholds
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions
 from sharpfield.preparation.calibrate.calibrate import calibrate as measure
 from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
@@ -36,5 +37,6 @@ def calibrate(
     console.print(as_text(about), soft_wrap=True)
     console.print(f"Numbers and a map of the pixels are in {out}; see {out / IMAGE}")
     if write_capture is not None:
-        notes = held.notes | {"threshold_off": made.negative, "threshold_on": made.positive}
-        native.write(replace(held, notes=notes, name=write_capture.name), write_capture)
+        measured = Thresholds(made.negative, made.positive, "estimated")
+        known = replace(held.known, thresholds=measured)
+        native.write(replace(held, known=known, name=write_capture.name), write_capture)

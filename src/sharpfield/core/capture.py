@@ -22,7 +22,59 @@ USUAL_THRESHOLD = 0.2
 """Contrast threshold of an event camera that nobody has measured, in natural log."""
 
 Note = Shaped[np.ndarray, "..."] | float | str
-"""A fact about a capture that only some sources know."""
+"""A remark about a capture, for people to read: no computation depends on it."""
+
+Certainty = Literal["known", "estimated", "unknown"]
+"""How well something is known: measured or stated, guessed from other data, or not at all."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Contrast thresholds of an event camera in natural log, both positive; medians over pixels."""
+
+    negative: float
+    positive: float
+    certainty: Certainty = "known"
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known about a capture besides the measurements themselves."""
+
+    poses: Certainty = "known"
+    """Unknown: the trajectory is a placeholder, a camera that stands still."""
+    motion: Certainty = "known"
+    """Motion of the camera during exposures. Unknown: each frame has a single pose and a made-up
+    time, and may be blurred or sharp."""
+    intrinsics: Certainty = "known"
+    """Unknown: the focal length is a placeholder."""
+    bounds: Certainty = "known"
+    """Depth bounds `near` and `far`. Unknown: both are placeholders."""
+    thresholds: Thresholds | None = None
+    """Contrast thresholds of the event camera; None where they are unknown."""
+    log_floor: float | None = None
+    """Linear light that the event camera adds before it takes the logarithm."""
+    refractory_us: float | None = None
+    """How long an event pixel is blind after an event, in us."""
+    background: Literal["", "white"] = ""
+    """White: transparent pixels were composited on white."""
+    reference_poses: Literal["frames", "trajectory"] = "frames"
+    """Poses over which the authors of a data set normalise the scene."""
+
+    def __post_init__(self) -> None:
+        numbers = {"log_floor": self.log_floor, "refractory_us": self.refractory_us}
+        if self.thresholds is not None:
+            numbers |= {"threshold_negative": self.thresholds.negative}
+            numbers |= {"threshold_positive": self.thresholds.positive}
+        for name, value in numbers.items():
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise CaptureError(f"`{name}` must be a finite number, not negative", got=value)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Names of what is unknown among poses, motion, intrinsics and bounds."""
+        names = ("poses", "motion", "intrinsics", "bounds")
+        return tuple(name for name in names if getattr(self, name) == "unknown")
 
 
 @dataclass(frozen=True)
@@ -76,8 +128,10 @@ class Capture:
     name: str = "capture"
     source: str = ""
     """The layout it was read from."""
+    known: Known = Known()
+    """What is known, estimated or unknown of poses, lens, bounds and event camera."""
     notes: dict[str, Note] = field(default_factory=dict[str, Note])
-    """What the source says besides: thresholds of a simulation, rounding of times, ..."""
+    """Remarks for people, such as which frames were left out; no computation depends on them."""
 
     def __post_init__(self) -> None:
         if self.frames is None and self.events is None:
@@ -153,14 +207,6 @@ class Capture:
         middle = exposure.middle_us[frames] + round(exposure.readout_us(held.height) / 2)
         time = torch.as_tensor(self.clock.unit(middle)).float()
         return self.trajectory.pose(time, torch.as_tensor(held.track[frames]))
-
-    def threshold(self, sign: Literal["off", "on"]) -> float | None:
-        """Contrast threshold to darker or to brighter, natural log; None if it is not noted.
-
-        Where pixels have thresholds of their own, the median over them.
-        """
-        noted = self.notes.get(f"threshold_{sign}")
-        return None if noted is None else float(np.median(np.asarray(noted, float)))
 
     def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
         """The same capture with frames or events taken away."""

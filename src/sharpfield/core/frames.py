@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64, Shaped, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8, UInt16
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
@@ -102,6 +102,8 @@ class Frames:
     """Along the camera's axis, at pixel centres, in world units; infinite where nothing is."""
     flow: Float32[np.ndarray, "n h w 2"] | None = None
     """How fast the point seen at a pixel's centre moves over the image (x, y), in px per second."""
+    blur_px: Float64[np.ndarray, "n"] | None = None
+    """True length of the motion blur of each frame, where it is known."""
 
     def __post_init__(self) -> None:
         counts = {

@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.core.capture import USUAL_THRESHOLD, Capture
+from sharpfield.core.capture import Capture
 from sharpfield.core.device import device_of
 from sharpfield.core.protocols import Model
 from sharpfield.core.tone import luma
 from sharpfield.events.image import window_image
 from sharpfield.events.index import EventIndex
+from sharpfield.events.threshold import thresholds_of
 from sharpfield.metrics.image import ssim
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.storage.event_cache import event_index
@@ -117,12 +118,12 @@ def recorded_counts(
 
 def usual_threshold(capture: Capture) -> float:
     """Mean of the thresholds to darker and to brighter."""
-    return sum(_thresholds(capture)) / 2
+    return sum(thresholds_of(capture)) / 2
 
 
 def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
     """Means over event frames."""
-    off, on = _thresholds(capture)
+    off, on = thresholds_of(capture)
     usual = usual_threshold(capture)
     recorded = [on * counts[1] - off * counts[0] for _, counts in pairs]
     most = max(float(torch.stack(recorded).abs().max()), usual)
@@ -144,12 +145,6 @@ def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
             }
         )
     return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
-
-
-def _thresholds(capture: Capture) -> tuple[float, float]:
-    """To darker and to brighter, as noted."""
-    off, on = capture.threshold("off"), capture.threshold("on")
-    return off or USUAL_THRESHOLD, on or USUAL_THRESHOLD
 
 
 def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:

@@ -40,7 +40,7 @@ def input_name(capture: Capture) -> str:
     """What to call recorded frames: blurry if they were, or may have been, exposed for a while."""
     frames = capture.frames
     lasting = frames is not None and not frames.exposure.instant[capture.split.train].all()
-    return BLURRY if lasting or capture.notes.get("motion") == "unknown" else SHARP_INPUT
+    return BLURRY if lasting or capture.known.motion == "unknown" else SHARP_INPUT
 
 
 def compared_views(

@@ -110,9 +110,11 @@ def _positive(negative: float, positive: float) -> None:
         )
 
 
-def thresholds_of(capture: Capture, given: tuple[float, float] | None) -> tuple[float, float]:
-    """Contrast thresholds to darker and to brighter: given, noted by the capture, or the usual."""
+def thresholds_of(
+    capture: Capture, given: tuple[float, float] | None = None
+) -> tuple[float, float]:
+    """Contrast thresholds, negative and positive: given, known to the capture, or the usual 0.2."""
     if given is not None:
         return given
-    negative, positive = capture.threshold("off"), capture.threshold("on")
-    return negative or USUAL_THRESHOLD, positive or USUAL_THRESHOLD
+    known = capture.known.thresholds
+    return (known.negative, known.positive) if known else (USUAL_THRESHOLD, USUAL_THRESHOLD)

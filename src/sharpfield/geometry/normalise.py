@@ -44,9 +44,6 @@ def focus(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"] | None:
     return point if before.mean() > 0.5 else None
 
 
-REFERENCE = "reference_poses"
-"""Note of a capture that says which poses its normalisation is taken over."""
-
 PATH_SAMPLES = 256
 """Instants at which a trajectory without frames of its own is looked at."""
 
@@ -54,12 +51,11 @@ PATH_SAMPLES = 256
 def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
     """The poses that stand for a capture: its frames', or the moving track's.
 
-    Published data sets average over one or the other; the note `reference_poses` ("frames" or
-    "trajectory") of a capture says which. Without frames it is the trajectory, of all cameras if
-    they stand still.
+    Published data sets average over one or the other; `Capture.known.reference_poses` says which.
+    Without frames it is the trajectory, of all cameras if they stand still.
     """
     known = capture.trajectory.known_us(0)
-    along = capture.notes.get(REFERENCE, "frames") == "trajectory" or capture.frames is None
+    along = capture.known.reference_poses == "trajectory" or capture.frames is None
     if along and known is not None:
         path = capture.trajectory
         path = path.moving[0] if isinstance(path, Tracks) else path

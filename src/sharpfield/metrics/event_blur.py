@@ -16,8 +16,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from sharpfield.core.capture import USUAL_THRESHOLD, Capture
+from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
+from sharpfield.events.threshold import thresholds_of
 
 PARTS = 16
 """Parts of an exposure."""
@@ -70,8 +71,7 @@ def _changes(capture: Capture, frame: int) -> Float32[np.ndarray, "k h w"]:
     events, camera = capture.needed_events, capture.camera
     opens, closes = capture.needed_frames.exposure.window(frame)
     inside = events.window(opens, max(closes, opens + 1))
-    off = capture.threshold("off") or USUAL_THRESHOLD
-    on = capture.threshold("on") or USUAL_THRESHOLD
+    off, on = thresholds_of(capture)
     part = (inside.t_us - opens) * PARTS // max(closes - opens, 1)
     column = np.clip(np.floor(inside.x), 0, camera.width - 1).astype(np.int64)
     row = np.clip(np.floor(inside.y), 0, camera.height - 1).astype(np.int64)

@@ -23,8 +23,6 @@ from sharpfield.storage.images import list_images, read_image, write_image
 
 SHOWN = 5
 """Frames at each end of the ranking that the image shows."""
-BLUR_NOTE = "blur_px"
-"""Note of a simulated capture: the true blur of each frame."""
 
 
 @dataclass(frozen=True)
@@ -138,10 +136,8 @@ def _shown(capture: Capture, frame: int) -> UInt8[np.ndarray, "h w *c"]:
 
 
 def _true_blur(capture: Capture, found: Quality) -> Float64[np.ndarray, "m"] | None:
-    true = capture.notes.get(BLUR_NOTE)
-    if not isinstance(true, np.ndarray) or len(true) != len(capture.needed_frames):
-        return None
-    return true[found.frames].astype(np.float64)
+    true = capture.needed_frames.blur_px
+    return None if true is None else true[found.frames]
 
 
 def _ranks(values: Float64[np.ndarray, "m"]) -> Float64[np.ndarray, "m"]:

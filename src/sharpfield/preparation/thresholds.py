@@ -43,10 +43,8 @@ class Found:
 
 def known_thresholds(capture: Capture) -> FixedThresholds | None:
     """What the source of the capture says of both signs; None if it is silent."""
-    negative, positive = capture.threshold("off"), capture.threshold("on")
-    if negative is None or positive is None:
-        return None
-    return FixedThresholds(negative, positive)
+    known = capture.known.thresholds
+    return None if known is None else FixedThresholds(known.negative, known.positive)
 
 
 def find_thresholds(capture: Capture, motion: EventMotion) -> Found:

@@ -324,7 +324,7 @@ class Model(nn.Module):
         recipe, volume = self.recipe, self.volume
         prior, until = recipe.prior, recipe.prior.until
         weight = cosine(prior.weight, prior.end, begin=0, until=until)
-        known = self.capture.notes.get("motion") != "unknown"
+        known = self.capture.known.motion != "unknown"
         sharpened = self.events is not None and prior.weight > 0 and known
         if recipe.frames.blur == "motion" or (recipe.frames.blur == "auto" and known):
             targets = None

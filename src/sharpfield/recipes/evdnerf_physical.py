@@ -126,7 +126,8 @@ class Model(nn.Module):
         self.tone = tone_of(capture.frames.encoding if capture.frames else "linear")
         self.table = pair_table(self.capture, index)
         camera, path = self.capture.camera, self.capture.trajectory
-        self.floor = float(capture.notes.get("log_floor", recipe.windows.floor))
+        floor = capture.known.log_floor
+        self.floor = recipe.windows.floor if floor is None else floor
         self.sensor = LogContrast(camera, path, FixedResponse(floor=self.floor))
         kind = LearnedThresholds if recipe.windows.learn_threshold else FixedThresholds
         self.thresholds = kind(*thresholds_of(capture, recipe.windows.threshold))

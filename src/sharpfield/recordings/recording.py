@@ -102,6 +102,10 @@ class Recording:
     """Reads the trigger edges; None if the format has none."""
     bayer: str = ""
     """Colour filter tile of the raw sensor, e.g. "RGGB"; "" if mono or not known."""
+    thresholds: tuple[float, float] | None = None
+    """Contrast thresholds in natural log, negative and positive, where the file states them."""
+    frame_encoding: str = ""
+    """How values of frames relate to light (see `core.frames.ENCODINGS`); "" if not known."""
     trouble: ReadLog = field(default_factory=ReadLog)
     """What reading has left out so far; reading again tells the same, and not twice as much."""
     notes: dict[str, str] = field(default_factory=dict)

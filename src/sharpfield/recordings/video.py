@@ -61,7 +61,8 @@ def open_video(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         "video",
         frames=lambda: _decoded(path, interval_us, trouble.anew("frames")),
         trouble=trouble,
-        notes={"encoding": "srgb", "frame_size": f"{first.image.shape[1]}x{first.image.shape[0]}"},
+        frame_encoding="srgb",
+        notes={"frame_size": f"{first.image.shape[1]}x{first.image.shape[0]}"},
     )
 
 
@@ -97,7 +98,7 @@ def open_images(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         for file, open_us, close_us in zip(files, opens.tolist(), closes.tolist(), strict=True):
             yield Frame(read_image(file), open_us, close_us, file.stem)
 
-    return Recording(path, "images", frames=frames, notes={"encoding": "srgb"})
+    return Recording(path, "images", frames=frames, frame_encoding="srgb")
 
 
 def _decoded(path: Path, interval_us: float | None, trouble: ReadLog) -> Iterator[Frame]:

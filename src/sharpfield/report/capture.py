@@ -56,7 +56,7 @@ def _counts(capture: Capture) -> dict[str, object]:
         lasting = frames.exposure.duration_us[~frames.exposure.instant] / 1000
         if len(lasting):
             counts["exposure"] = f"{len(lasting)} frames of {_span(lasting)} ms"
-        elif capture.notes.get("motion") == "unknown":
+        elif capture.known.motion == "unknown":
             counts["exposure"] = "unknown; the photos may be blurred by unknown motion"
     if events is not None and len(events):
         seconds = max(float(events.t_us[-1] - events.t_us[0]) / 1e6, 1e-6)

@@ -72,7 +72,7 @@ def trajectory_figure(capture: Capture) -> str:
 def timeline_figure(capture: Capture) -> str | None:
     """When the shutters were open, and how many events came; None if times are made up."""
     frames, events = capture.frames, capture.events
-    if events is None and (frames is None or capture.notes.get("motion") == "unknown"):
+    if events is None and (frames is None or capture.known.motion == "unknown"):
         return None
     drawing, (axes,) = _drawing(7.6, 1.7, columns=1)
     origin = capture.clock.origin_us

@@ -127,7 +127,7 @@ class ViewSampler:
         if self.motion is not None and self.motion.channel is None:
             events = self.motion.events
             self.index = None if events.rectified else event_index(events)
-        known = capture.notes.get("motion") != "unknown"
+        known = capture.known.motion != "unknown"
         if self.motion is not None and frames is not None and options.sharp > 0 and known:
             self.sharp = SharpInstants(capture, self.motion, self.index)
         self.depth = None

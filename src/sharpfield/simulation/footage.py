@@ -5,7 +5,7 @@ few hundred images per second, or motion of less than about a pixel from one to 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -194,7 +194,8 @@ def simulate_footage(
         split=Split(np.arange(len(first)), np.zeros(0, np.int64)),
         name=footage.name,
         source="simulation from footage",
-        notes={"poses": "unknown", **recorder.notes()},
+        known=replace(recorder.known(), poses="unknown", intrinsics="unknown", bounds="unknown"),
+        notes=recorder.notes(),
     )
 
 

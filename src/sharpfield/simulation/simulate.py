@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
@@ -75,8 +75,12 @@ class Recorder:
         """All events."""
         return joined(self._gaps, self._size, bayer=self._event_sensor.bayer)
 
+    def known(self) -> Known:
+        """What a capture knows about its event camera."""
+        return self._pixels.known()
+
     def notes(self) -> dict[str, Note]:
-        """What a capture should say about its sensors."""
+        """Remarks of a capture about its sensors."""
         return {**self._pixels.notes(), "row_delay_us": self._frame_sensor.row_delay_us}
 
 
@@ -211,6 +215,7 @@ def simulate(
         split=Split(np.setdiff1d(np.arange(timing.frames), timing.test), timing.test),
         name=place.name,
         source="simulation",
+        known=recorder.known(),
         notes=recorder.notes(),
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.events import EventStream, merged
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.protocols import Trajectory
@@ -30,7 +30,7 @@ MOVING_TIMING = Timing(frames=33, exposure_us=0, interval_us=31_250, step_us=125
 is for testing."""
 
 MAPS = ("threshold_on_map", "threshold_off_map")
-"""Notes of a recorder that give a number for each pixel."""
+"""Notes that give a threshold for each pixel."""
 
 RING = ring(8, held_out=4)
 
@@ -41,6 +41,7 @@ class _Track:
 
     frames: Frames
     events: EventStream
+    known: Known
     notes: dict[str, Note]
 
 
@@ -63,8 +64,8 @@ def simulate_moving(
         seed: Of the sensors' differences and their noise.
 
     Returns:
-        A capture with everything known. `notes` say the thresholds; where pixels differ, also the
-        thresholds of each pixel of each track.
+        A capture with everything known. Where pixels differ, `notes` give the thresholds of each
+        pixel of each track.
     """
     place = moving_scene(place) if isinstance(place, str) else place
     clock = Clock(0, timing.span_us())
@@ -92,6 +93,7 @@ def simulate_moving(
         split=_split(frames, held_out, timing),
         name=place.name,
         source="simulation",
+        known=recorded[0].known,
         notes=notes,
     )
 
@@ -109,7 +111,7 @@ def _record(
     seen = [depth_and_flow(place, rig.camera(), path, int(t)) for t in exposure.middle_us]
     depth, flow = (np.stack(values) for values in zip(*seen, strict=True))
     frames = replace(recorder.frames(), depth=depth, flow=flow)
-    return _Track(frames, recorder.events(), recorder.notes())
+    return _Track(frames, recorder.events(), recorder.known(), recorder.notes())
 
 
 def _joined(tracks: Sequence[Frames]) -> Frames:

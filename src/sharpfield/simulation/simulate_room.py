@@ -3,7 +3,7 @@
 Frames are taken evenly; the shutter is open for the same time in each, as long as it takes for a
 wanted share of them to be blurred. Which ones are sharp is up to the walk: those of its pauses. All
 else is known: the sharp image and the depth in the middle of each exposure, the pose at any time,
-and the true blur of every frame (`notes["blur_px"]`, see `simulation.travel`). Held-out frames are
+and the true blur of every frame (`Frames.blur_px`, see `simulation.travel`). Held-out frames are
 instants, and therefore sharp.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt16
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import MILLIMETRE, DepthMaps, Exposure, Frames
@@ -42,9 +42,6 @@ OPEN_OF_INTERVAL = 0.9
 """Longest exposure over the interval between two."""
 FARTHEST_M = 65.0
 """Depth that 16 bits of millimetres can hold."""
-
-BLUR_NOTE = "blur_px"
-"""Note of a capture: true blur of each frame."""
 
 Blur = Literal["motion", "published"]
 
@@ -132,7 +129,7 @@ def simulate_room(
         seed: Of the walk, the kernels and the noise.
 
     Returns:
-        A capture with measured depth, truth of every frame, and in `notes` its true blur.
+        A capture with measured depth, and the truth and true blur of every frame.
     """
     place, camera, clock = room(), rig.camera(), Clock(0, timing.span_us())
     path = walk(timing.span_us(), seed)
@@ -156,13 +153,14 @@ def simulate_room(
         clock=clock,
         near=place.near,
         far=place.far,
-        frames=frames,
+        frames=replace(frames, blur_px=blur),
         events=events,
         split=Split(np.flatnonzero(~timing.held_out), np.flatnonzero(timing.held_out)),
         depth=DepthMaps(np.stack(stored), camera),
         name=place.name,
         source="simulation",
-        notes={BLUR_NOTE: blur, **recorded.notes()},
+        known=recorded.known(),
+        notes=recorded.notes(),
     )
 
 
@@ -293,8 +291,12 @@ class _Recorded:
             return None
         return joined(self._gaps, self._rig.size, bayer=self._rig.event_sensor.bayer)
 
+    def known(self) -> Known:
+        """What a capture knows about the event camera, if there was one."""
+        return Known() if self._pixels is None else self._pixels.known()
+
     def notes(self) -> dict[str, Note]:
-        """What a capture should say about the event camera."""
+        """Remarks of a capture about the event camera."""
         return {} if self._pixels is None else self._pixels.notes()
 
 

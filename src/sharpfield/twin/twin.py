@@ -263,19 +263,13 @@ def light_of(
 
 def recorded_sensor(capture: Capture) -> EventSensor:
     """Ideal pixels, with the thresholds, dead time and colour filter that a capture states."""
-    ideal = EventSensor()
-    known = {
-        "threshold_on": "threshold_on",
-        "threshold_off": "threshold_off",
-        "refractory_us": "refractory_us",
-        "floor": "log_floor",
-    }
-    noted = {
-        name: float(value)
-        for name, note in known.items()
-        if isinstance(value := capture.notes.get(note), float | int)
-    }
-    return replace(ideal, **noted, refractory_rule="reset", bayer=filter_of(capture))
+    known = capture.known
+    stated = {"refractory_us": known.refractory_us, "floor": known.log_floor}
+    if known.thresholds is not None:
+        stated |= {"threshold_off": known.thresholds.negative}
+        stated |= {"threshold_on": known.thresholds.positive}
+    stated = {name: value for name, value in stated.items() if value is not None}
+    return replace(EventSensor(), **stated, refractory_rule="reset", bayer=filter_of(capture))
 
 
 def filter_of(capture: Capture) -> str:

@@ -144,10 +144,15 @@ def with_depth(panning: Capture) -> Capture:
     even = np.broadcast_to(panning.frames.images[:, :1, :1], panning.frames.images.shape).copy()
     return replace(
         panning,
-        frames=replace(panning.frames, images=even, truth=even, truth_known=np.arange(9) % 2 == 0),
+        frames=replace(
+            panning.frames,
+            images=even,
+            truth=even,
+            truth_known=np.arange(9) % 2 == 0,
+            blur_px=np.linspace(0, 4, 9),
+        ),
         events=None,
         depth=DepthMaps(maps, panning.camera),
-        notes={"blur_px": np.linspace(0, 4, 9)},
     )
 
 
@@ -162,7 +167,7 @@ def test_what_is_written_for_scannet_is_read_again(panning, tmp_path):
     np.testing.assert_allclose(made.frames.images.astype(int), capture.frames.images, atol=6)
     np.testing.assert_array_equal(made.frames.truth_known, capture.frames.truth_known)
     np.testing.assert_array_equal(made.frames.truth[::2], capture.frames.truth[::2])
-    np.testing.assert_allclose(made.notes["blur_px"], capture.notes["blur_px"])
+    np.testing.assert_allclose(made.frames.blur_px, capture.frames.blur_px)
     assert made.camera == capture.camera
 
 

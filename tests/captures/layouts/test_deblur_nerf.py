@@ -41,7 +41,7 @@ def test_the_focal_length_follows_the_images(tmp_path):
     assert capture.camera.fx_px == capture.camera.fy_px == pytest.approx(10.0)
     assert (capture.camera.cx_px, capture.camera.cy_px) == (4, 3)
     assert (capture.near, capture.far) == (2, 20)
-    assert capture.notes["motion"] == "unknown"
+    assert capture.known.motion == "unknown"
 
 
 @pytest.mark.parametrize(

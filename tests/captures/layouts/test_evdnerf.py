@@ -10,7 +10,7 @@ import pytest
 from sharpfield.captures.read import layout_of, read
 from sharpfield.captures.writers import evdnerf as write_evdnerf
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.frames import Exposure, Frames
@@ -74,7 +74,7 @@ def rig() -> Capture:
         events=stream((0, 1), 3_000, 1),
         test_events=stream((2,), 900, 2),
         split=Split(np.arange(2 * TIMES), np.array([2 * TIMES + 4])),
-        notes={"threshold_on": 0.2, "threshold_off": 0.2},
+        known=Known(thresholds=Thresholds(0.2, 0.2)),
     )
 
 
@@ -126,7 +126,7 @@ def test_what_is_written_is_read(rig: Capture, folder: Path) -> None:
     np.testing.assert_array_equal(found.split.train, rig.split.train)
     np.testing.assert_array_equal(found.split.test, 2 * TIMES + np.array([4, 12]))
     assert (found.near, found.far) == pytest.approx((2, 6))
-    assert found.notes["threshold_on"] == 0.2
+    assert found.known.thresholds.positive == 0.2
     for name in ("events", "test_events"):
         window = getattr(rig, name).window(START_US, START_US + SECOND_US)
         for track in range(VIEWS):
@@ -156,7 +156,7 @@ def test_sums_alone_become_a_stream_with_the_same_sums(
     text = (folder / "transforms_train.json").read_text()
     (folder / "transforms_train.json").write_text(text.replace("threshold_", "was_"))
     found = read(folder)
-    assert found.notes["threshold_on"] == pytest.approx(0.2, rel=1e-6)
+    assert found.known.thresholds.positive == pytest.approx(0.2, rel=1e-6)
     assert "spread evenly" in found.notes["event_times"]
     for track in (0, 1):
         expected = sums(rig.needed_events, track, START_US)
@@ -273,7 +273,7 @@ def test_what_the_layout_has_no_place_for_is_refused(rig: Capture, tmp_path: Pat
         "cameras that move": replace(
             rig, trajectory=moving, frames=replace(frames, track=frames.track)
         ),
-        "events of unknown thresholds": replace(rig, notes={}),
+        "events of unknown thresholds": replace(rig, known=Known()),
         "a lens": replace(rig, camera=replace(rig.camera, cx_px=3.0)),
     }
     for what, capture in cases.items():

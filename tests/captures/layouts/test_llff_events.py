@@ -7,6 +7,7 @@ import torch
 
 from sharpfield.captures.layouts import llff_events
 from sharpfield.captures.read import read
+from sharpfield.core.capture import Known, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 
@@ -145,12 +146,8 @@ def test_the_trajectory_gives_the_poses_of_frames(blender):
 
 def test_what_the_notes_say(blender):
     folder, _, _ = blender
-    assert read(folder).notes == {
-        "event_times": "rounded from ns to us",
-        "reference_poses": "frames",
-        "threshold_on": 0.2,
-        "threshold_off": 0.2,
-    }
+    assert read(folder).notes == {"event_times": "rounded from ns to us"}
+    assert read(folder).known == Known(thresholds=Thresholds(0.2, 0.2))
 
 
 def test_events_without_a_pose_are_dropped_and_counted(blender):
@@ -183,7 +180,7 @@ def test_options_overrule_the_layout(blender):
     capture = read(folder, encoding="srgb", hold_out="last:2", threshold=0.3)
     assert capture.frames.encoding == "srgb"
     np.testing.assert_array_equal(capture.split.test, [7, 8])
-    assert capture.notes["threshold_on"] == capture.notes["threshold_off"] == 0.3
+    assert capture.known.thresholds == Thresholds(0.3, 0.3)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("ns", 1), ("us", 1e-3), ("ms", 1e-6), ("s", 1e-9)])
@@ -228,8 +225,8 @@ def test_what_differs_from_blender(davis):
     capture = read(folder)
     assert capture.frames.encoding == "linear"
     np.testing.assert_array_equal(capture.split.test, range(4, 9))
-    assert capture.notes["reference_poses"] == "trajectory"
-    assert capture.notes["threshold_on"] == 0.25
+    assert capture.known.reference_poses == "trajectory"
+    assert capture.known.thresholds.positive == 0.25
     assert capture.near == 1.5  # the nearest of the trajectory, not of the frames
     assert "event_times" not in capture.notes
 

@@ -78,10 +78,10 @@ def test_bounds_are_guessed_from_what_the_cameras_look_at(tmp_path):
     written(tmp_path)
     capture = nerfstudio.read(tmp_path)
     assert (capture.near, capture.far) == pytest.approx((0.5, 50))
-    assert "guessed" in capture.notes["bounds"]
+    assert capture.known.bounds == "estimated"
     told = nerfstudio.read(tmp_path, bounds=(1.0, 7.0))
     assert (told.near, told.far) == (1, 7)
-    assert "bounds" not in told.notes
+    assert told.known.bounds == "known"
 
 
 def test_parallel_cameras_look_at_no_point():

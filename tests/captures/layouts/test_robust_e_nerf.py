@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sharpfield.captures.read import layout_of, read
+from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 
@@ -79,8 +80,8 @@ def test_a_scene(folder: Path) -> None:
     np.testing.assert_allclose(poses[:, 0, 3], [0.1, 0.15], atol=1e-6)
     events = found.needed_events
     assert len(events) == COUNT and events.bayer == "RGGB" and set(events.p) == {-1, 1}
-    assert found.notes["threshold_on"] == 0.25 and found.notes["threshold_off"] == 0.5
-    assert found.notes["refractory_us"] == 8.0
+    assert found.known.thresholds == Thresholds(0.5, 0.25)
+    assert found.known.refractory_us == 8.0
     assert found.frames is None
 
 
@@ -103,7 +104,7 @@ def test_images_of_another_camera_are_left_out(folder: Path) -> None:
 def test_a_real_cameras_thresholds_are_not_known(folder: Path) -> None:
     change = {"pos_contrast_threshold": np.array(np.nan)}
     np.savez(folder / "camera_calibration.npz", **calibration(**change))
-    assert "threshold_on" not in read(folder).notes
+    assert read(folder).known.thresholds is None
 
 
 @pytest.mark.parametrize(

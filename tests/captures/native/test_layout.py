@@ -6,7 +6,7 @@ import torch
 
 from sharpfield.captures.native import layout as native
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.core.frames import DepthMaps
@@ -116,12 +116,26 @@ def variations(panning: Capture) -> dict[str, Capture]:
         "notes": replace(
             panning,
             notes={
-                "threshold_on": 0.1 + 0.2,
+                "lux": 0.1 + 0.2,
                 "panning": 5e-324,
                 "count": 3,
                 "file": np.arange(4, dtype=np.int16).reshape(2, 2),
                 "a word.with [dots]": 'quotes " and \\ and \n lines',
             },
+        ),
+        "what is known": replace(
+            panning,
+            frames=replace(frames, blur_px=draw.random(9)),
+            known=Known(
+                poses="estimated",
+                motion="unknown",
+                bounds="unknown",
+                thresholds=Thresholds(0.1 + 0.2, 0.7, "estimated"),
+                log_floor=1e-3,
+                refractory_us=40.0,
+                background="white",
+                reference_poses="trajectory",
+            ),
         ),
         "names": replace(panning, name='ga"rden', source="simulation"),
         "a rig": replace(
@@ -171,6 +185,7 @@ def variations(panning: Capture) -> dict[str, Capture]:
         "points",
         "frames in no part and in both",
         "notes",
+        "what is known",
         "names",
         "a rig",
         "a rig that saw nothing",
@@ -306,11 +321,14 @@ def test_events_of_another_tool_may_need_their_unit(panning, tmp_path):
 
 def test_a_capture_without_poses_is_read_only_by_what_needs_none(panning, tmp_path):
     unposed = replace(
-        panning, trajectory=Still(np.eye(3, 4)[None]), notes={"poses": "unknown", "lux": 3.0}
+        panning,
+        trajectory=Still(np.eye(3, 4)[None]),
+        known=Known(poses="unknown"),
+        notes={"lux": 3.0},
     )
     native.write(unposed, tmp_path)
     assert differences(native.read_unposed(tmp_path), unposed) == []
-    with pytest.raises(CaptureError, match="nobody knows yet where the camera was") as caught:
+    with pytest.raises(CaptureError, match="the poses of the camera are unknown") as caught:
         native.read(tmp_path)
     assert "sharpfield poses" in str(caught.value)
     assert str(tmp_path) in str(caught.value)

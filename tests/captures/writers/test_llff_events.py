@@ -7,7 +7,7 @@ import pytest
 from sharpfield.captures.read import read
 from sharpfield.captures.writers import llff_events as write_llff_events
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Split
+from sharpfield.core.capture import Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.geometry.trajectory import Stamped, Still, Tracks
@@ -51,10 +51,9 @@ def test_a_mono_capture_comes_back(panning, tmp_path):
 
 
 def test_known_thresholds_come_back(panning, tmp_path):
-    noted = replace(panning, notes={"threshold_on": 0.31, "threshold_off": 0.17})
-    found = returned(noted, tmp_path).notes
-    assert (found["threshold_on"], found["threshold_off"]) == (0.31, 0.17)
-    assert returned(panning, tmp_path).notes["threshold_on"] == 0.2  # the authors' own
+    noted = replace(panning, known=Known(thresholds=Thresholds(0.17, 0.31)))
+    assert returned(noted, tmp_path).known.thresholds == Thresholds(0.17, 0.31)
+    assert returned(panning, tmp_path).known.thresholds == Thresholds(0.2, 0.2)  # the authors' own
 
 
 def test_its_files_are_those_of_the_published_data(panning, tmp_path):
@@ -109,7 +108,7 @@ def test_a_colour_capture_comes_back(panning, tmp_path):
         np.testing.assert_array_equal(
             getattr(found.events.site_colour, name), getattr(capture.events.site_colour, name)
         )
-    assert found.notes["reference_poses"] == "trajectory"
+    assert found.known.reference_poses == "trajectory"
 
 
 def test_stills_beside_the_trajectory_come_back(panning, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from sharpfield.captures.native import layout as native
 from sharpfield.cli.doctor import doctor
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Known, Split
 from sharpfield.core.frames import Exposure
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.doctor.doctor import examine, examine_path
@@ -121,7 +121,7 @@ PLANTED: dict[str, tuple[Callable[[Capture], Capture], str, str]] = {
 def test_objects_on_white_are_not_overexposed() -> None:
     """As NeRF-synthetic's, whose background is white."""
     white = overexposed(sound())
-    rendered = replace(white, notes=white.notes | {"background": "white"})
+    rendered = replace(white, known=Known(background="white"))
     for capture, told in ((white, True), (rendered, False)):
         checkup = Checkup("object")
         check_light(capture, checkup)
@@ -164,7 +164,7 @@ def test_half_a_trajectory_in_a_folder_is_a_finding_not_a_failure(tmp_path: Path
 
 
 def test_a_capture_without_poses_is_looked_at_as_far_as_it_goes() -> None:
-    bare = replace(sound(), notes=sound().notes | {native.POSES: native.UNKNOWN})
+    bare = replace(sound(), known=replace(sound().known, poses="unknown"))
     found = examine(bare)
     assert not found.has("error")
     assert "poses-unknown" in {one.check for one in found.findings}

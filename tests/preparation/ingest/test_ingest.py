@@ -188,7 +188,7 @@ def test_frames_and_events_of_one_file(truth, tmp_path, container):
 
 def test_what_was_ingested_waits_for_its_poses(truth, tmp_path):
     _, folder = ingested(truth, tmp_path)
-    with pytest.raises(CaptureError, match="nobody knows yet where the camera was"):
+    with pytest.raises(CaptureError, match="the poses of the camera are unknown"):
         read(folder)
 
 

@@ -52,7 +52,7 @@ def image(width: int, height: int) -> np.ndarray:
 def test_without_a_calibration_the_lens_is_unknown():
     found = geometry(SIZE, SIZE, Optics(), "cam.raw")
     assert found.camera.fx_px == WIDTH
-    assert found.notes == {"intrinsics": "unknown"}
+    assert found.intrinsics == "unknown"
     np.testing.assert_array_equal(found.image(image(*SIZE), "")[..., 0], image(*SIZE))
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import Capture, Known, Thresholds
 from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.events.threshold import LearnedThresholds
@@ -205,7 +205,7 @@ def test_what_is_known_needs_no_prior(tiny: Capture):
 
 
 def test_thresholds_come_from_the_capture_unless_given(tiny: Capture):
-    noted = replace(tiny, notes={**tiny.notes, "threshold_off": 0.31, "threshold_on": 0.17})
+    noted = replace(tiny, known=Known(thresholds=Thresholds(0.31, 0.17)))
     assert LearnedCalibration(LearnedCalibrationOptions(), noted, 0).guess == (0.31, 0.17)
     assert LearnedCalibration(NONE, noted, 0).guess == (0.3, 0.1)
 

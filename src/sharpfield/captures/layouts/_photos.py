@@ -1,8 +1,8 @@
 """Posed photographs: images whose poses are known, but not how the camera moved meanwhile.
 
 Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds.
-Whether such photos are blurred by motion, their exposures cannot tell; `notes["motion"]` is
-"unknown" then, and recipes with a learned blur kernel take it from there.
+Whether such photos are blurred by motion, their exposures cannot tell: `Known.motion` is "unknown"
+then, and recipes with a learned blur kernel start from that.
 """
 
 import re
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry.trajectory import Still
@@ -28,6 +28,10 @@ HOLD_OUT = "every:8"
 
 Missing = Literal["error", "skip"]
 """What to do about images that are named but not there."""
+
+
+PHOTOS = Known(motion="unknown")
+"""Of photos, each with one pose: they may be sharp or blurred."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,8 @@ def photo_capture(
     name: str,
     source: str,
     points: Float64[np.ndarray, "m 3"] | None = None,
-    notes: Mapping[str, float | str] | None = None,
+    known: Known = PHOTOS,
+    notes: Mapping[str, Note] | None = None,
 ) -> Capture:
     """A capture of photos that were taken one by one.
 
@@ -64,7 +69,8 @@ def photo_capture(
         name: Name of the scene.
         source: The layout it was read from.
         points: Sparse scene points.
-        notes: What else there is to say; by default that the motion is unknown.
+        known: What is known; by default all but the motion of the camera.
+        notes: Remarks for people.
     """
     count, height, width, _ = photos.images.shape
     taken_us = np.arange(count, dtype=np.int64) * SECOND_US
@@ -86,7 +92,8 @@ def photo_capture(
         points=points,
         name=name,
         source=source,
-        notes={"motion": "unknown", **(notes or {})},
+        known=known,
+        notes=dict(notes or {}),
     )
 
 

@@ -21,7 +21,7 @@ from sharpfield.captures.layouts._transforms import (
     images_of,
     read_views,
 )
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Known, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry.trajectory import Still
@@ -71,7 +71,8 @@ def read(folder: Path, *, missing: Missing = "error", encoding: str = "srgb") ->
         split=Split(every[:train], every[train:]),
         name=folder.resolve().name,
         source="d-nerf",
-        notes={"motion": "none", "background": "white", "clock": "said to last one second"},
+        known=Known(background="white"),
+        notes={"clock": "said to last one second"},
     )
 
 

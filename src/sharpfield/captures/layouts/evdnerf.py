@@ -35,7 +35,7 @@ from sharpfield.captures.layouts._transforms import (
     read_views,
 )
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Note, Split
+from sharpfield.core.capture import Capture, Known, Note, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked, merged
 from sharpfield.core.frames import Exposure, Frames
@@ -158,7 +158,7 @@ def read(folder: Path, *, trust_pickle: bool = False, threshold: float | None = 
         if name == "train" or (folder / f"transforms_{name}.json").is_file()
     ]
     expect_one_camera([one.views for one in sets], folder)
-    streams, notes = _streams(folder, sets, trust_pickle=trust_pickle, threshold=threshold)
+    streams, known, notes = _streams(folder, sets, trust_pickle=trust_pickle, threshold=threshold)
     images = images_of([one.views for one in sets])
     camera = _camera(sets[0].views, streams, images, folder)
     poses = np.concatenate([one.poses for one in sets])
@@ -176,6 +176,7 @@ def read(folder: Path, *, trust_pickle: bool = False, threshold: float | None = 
         split=_split(sets, has_images=images is not None),
         name=folder.resolve().name,
         source="evdnerf",
+        known=Known(thresholds=known),
         notes=notes,
     )
 
@@ -207,8 +208,8 @@ def _set(folder: Path, name: str) -> _Set:
 
 def _streams(
     folder: Path, sets: list[_Set], *, trust_pickle: bool, threshold: float | None
-) -> tuple[list[EventStream], dict[str, Note]]:
-    """The events of each view of all sets, and what there is to say about them."""
+) -> tuple[list[EventStream], Thresholds | None, dict[str, Note]]:
+    """The events of each view of all sets, their thresholds, and remarks."""
     streams: list[EventStream] = []
     notes: dict[str, Note] = {"clock": "said to last one second"}
     for one in sets:
@@ -236,18 +237,19 @@ def _streams(
             )
         elif one.name == "train":
             raise CaptureError("there are no events", where=folder, do=f"it needs {sums.name}")
-    return streams, notes | _thresholds(folder, threshold)
+    return streams, _thresholds(folder, threshold), notes
 
 
-def _thresholds(folder: Path, threshold: float | None) -> dict[str, Note]:
+def _thresholds(folder: Path, threshold: float | None) -> Thresholds | None:
     """Those given or found; or those stated, if both signs' are."""
     if threshold is not None:
-        return dict.fromkeys(THRESHOLDS, threshold)
+        return Thresholds(threshold, threshold)
     path = folder / "transforms_train.json"
     content = read_json(path)
     if not set(THRESHOLDS) <= content.keys():
-        return {}
-    return {name: number(content, name, path) for name in THRESHOLDS}
+        return None
+    negative, positive = (number(content, name, path) for name in THRESHOLDS)
+    return Thresholds(negative, positive)
 
 
 def _one_each(

@@ -20,7 +20,7 @@ from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.layouts.nerfstudio import guessed_bounds
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry.trajectory import Stamped, Tracks, check_poses
@@ -88,7 +88,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
         split=split,
         name=folder.resolve().name,
         source="event-nerf",
-        notes={"bounds": "guessed from where the cameras look"},
+        known=Known(bounds="estimated"),
     )
 
 

@@ -20,6 +20,7 @@ Frames* (CVPR 2024), its supplement and released data.
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -30,18 +31,17 @@ from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layouts._photos import choose_images
 from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import HELD_BACK_US, Capture, Clock
+from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry import se3
-from sharpfield.geometry.normalise import REFERENCE
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.arrays import load_array, load_arrays
 from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_columns import whole_us
-from sharpfield.storage.event_layouts import THRESHOLDS, open_events
+from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.images import list_images, read_images
 
 LAYOUT = "ev-deblur-nerf"
@@ -55,8 +55,6 @@ the trajectory at its time, was not taken on the trajectory."""
 RGGB = np.array([[0, 1], [1, 2]], np.int8)
 """Channels of the colour filter tile of a Color-DAVIS346."""
 
-Notes = dict[str, Shaped[np.ndarray, "..."] | float | str]
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -67,7 +65,7 @@ class Variant:
     hold_out: str
     threshold: float
     """Contrast threshold for both signs that the authors use."""
-    reference_poses: str
+    reference_poses: Literal["frames", "trajectory"]
     """The poses that their normalisation is taken over."""
 
 
@@ -112,7 +110,9 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     bounds = (along if variant.reference_poses == "trajectory" else table).bounds
     off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
     trajectory, track = _tracks(path, table, off)
-    events, notes = _events(folder, camera, path, event_unit=event_unit, variant=variant)
+    events, thresholds, notes = _events(
+        folder, camera, path, event_unit=event_unit, variant=variant
+    )
     names = tuple(file.stem for file in paths)
     truth, truth_known = _truth(folder / "truth.npz", names, images)
     return Capture(
@@ -126,8 +126,8 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
         split=split_by_rule(len(paths), variant.hold_out),
         name=folder.resolve().name,
         source=LAYOUT,
+        known=Known(thresholds=thresholds, reference_poses=variant.reference_poses),
         notes=notes
-        | {REFERENCE: variant.reference_poses}
         | ({"frames_off_trajectory": ", ".join(np.array(names)[off])} if off.any() else {}),
     )
 
@@ -203,10 +203,10 @@ def _tracks(
 
 def _events(
     folder: Path, camera: Camera, path: Stamped, *, event_unit: str | None, variant: Variant
-) -> tuple[EventStream, Notes]:
-    """Events while the pose is known, and what was done to them."""
+) -> tuple[EventStream, Thresholds, dict[str, Note]]:
+    """Events while the pose is known, their thresholds, and what was done to them."""
     known_us = path.known_us(0)
-    notes: Notes = dict.fromkeys(THRESHOLDS, variant.threshold)
+    notes: dict[str, Note] = {}
     with open_events(folder / "events.h5", unit=event_unit, size=camera.size) as opened:
         file = opened if opened.unit else replace(opened, unit=variant.event_unit)
         if len(file):
@@ -222,11 +222,10 @@ def _events(
             notes["events_outside_trajectory"] = float(len(file) - len(events))
         if file.unit == "ns":
             notes["event_times"] = "rounded from ns to us"
-        if file.thresholds is not None:
-            notes |= dict(zip(THRESHOLDS, file.thresholds, strict=True))
+        stated = file.thresholds or (variant.threshold, variant.threshold)
     if (folder / "ev_map.npz").is_file():
         events = replace(events, site_colour=_site_colour(folder / "ev_map.npz", camera))
-    return events, notes
+    return events, Thresholds(*stated), notes
 
 
 def _site_colour(path: Path, camera: Camera) -> SiteColour:

@@ -23,7 +23,7 @@ from sharpfield.captures.layouts._transforms import (
     read_json,
 )
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture, Known, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import read_images
 
@@ -85,7 +85,7 @@ def read(
         bounds=bounds,
         name=folder.resolve().name,
         source="nerf-synthetic",
-        notes={"motion": "none", "background": "white"},
+        known=Known(background="white"),
     )
 
 

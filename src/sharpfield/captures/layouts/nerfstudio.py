@@ -9,6 +9,7 @@
 Source: nerfstudio's documentation of its data format, and instant-ngp, where it comes from.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxtyping import Float64
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
+    PHOTOS,
     Missing,
     Photos,
     existing,
@@ -82,7 +84,7 @@ def read(
     frames, paths = [frames[i] for i in kept], [paths[i] for i in kept]
     names = [frame_name(frame["file_path"]) for frame in frames]
     poses = poses_of(frames, path)
-    notes = {} if bounds else {"bounds": "guessed from where the cameras look"}
+    known = PHOTOS if bounds else replace(PHOTOS, bounds="estimated")
     photos = Photos(
         images=read_images(paths),
         poses=poses,
@@ -97,7 +99,7 @@ def read(
         name=folder.resolve().name,
         source="nerfstudio",
         points=_points(folder, content, path),
-        notes=notes,
+        known=known,
     )
 
 

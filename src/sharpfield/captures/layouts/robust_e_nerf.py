@@ -30,7 +30,7 @@ from sharpfield.captures.layouts._transforms import (
 )
 from sharpfield.captures.layouts.nerfstudio import guessed_bounds
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import Capture, Clock, Note, Split
+from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.frames import Exposure, Frames
@@ -65,8 +65,6 @@ def read(folder: Path) -> Capture:
     events = _events(folder / EVENTS, camera, str(calibration.get("bayer_pattern", "")))
     near, far = guessed_bounds(path.poses)
     views = _views(folder, camera, path.clock)
-    notes: dict[str, Note] = {"bounds": "guessed from where the camera looks"}
-    notes |= _notes(calibration) | ({"views": views.left_out} if views.left_out else {})
     none = np.zeros(0, np.int64)
     return Capture(
         camera=camera,
@@ -79,7 +77,8 @@ def read(folder: Path) -> Capture:
         split=Split(none, np.arange(len(views.poses))),
         name=folder.resolve().name,
         source="robust-e-nerf",
-        notes=notes,
+        known=_known(calibration),
+        notes={"views": views.left_out} if views.left_out else {},
     )
 
 
@@ -149,19 +148,20 @@ def _events(path: Path, camera: Camera, bayer: str) -> EventStream:
     return checked(events, path)
 
 
-def _notes(calibration: Arrays) -> dict[str, Note]:
-    """Thresholds and dead time, where they are known (a real camera's are NaN or absent)."""
-    given = {
-        "threshold_on": ("pos_contrast_threshold", 1.0),
-        "threshold_off": ("neg_contrast_threshold", 1.0),
-        "refractory_us": ("refractory_period", 1e-3),
-    }
-    notes: dict[str, Note] = {}
-    for note, (name, scale) in given.items():
+def _known(calibration: Arrays) -> Known:
+    """Thresholds and refractory period where known; a real camera's are NaN or absent."""
+
+    def number(name: str) -> float | None:
         value = float(calibration[name].item()) if name in calibration else np.nan
-        if np.isfinite(value):
-            notes[note] = value * scale
-    return notes
+        return value if np.isfinite(value) else None
+
+    negative, positive = number("neg_contrast_threshold"), number("pos_contrast_threshold")
+    refractory_ns = number("refractory_period")
+    return Known(
+        bounds="estimated",
+        thresholds=Thresholds(negative, positive) if negative and positive else None,
+        refractory_us=None if refractory_ns is None else refractory_ns * 1e-3,
+    )
 
 
 @dataclass(frozen=True)

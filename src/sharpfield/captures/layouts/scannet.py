@@ -156,7 +156,7 @@ def _mesh(folder: Path) -> Float64[np.ndarray, "m 3"] | None:
 
 def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> Capture:
     """The sharp frames that a simulation wrote beside, and how blurred the others are."""
-    frames, notes = capture.needed_frames, dict(capture.notes)
+    frames = capture.needed_frames
     paths = [place / TRUTH / f"{name}.png" for name in frames.names]
     known = np.array([path.is_file() for path in paths])
     if known.any():
@@ -169,5 +169,5 @@ def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> 
         )
         frames = replace(frames, truth=truth, truth_known=known)
     if (place / TRUTH / BLUR).is_file():
-        notes["blur_px"] = read_matrix(place / TRUTH / BLUR)[kept, 0]
-    return replace(capture, frames=frames, notes=notes)
+        frames = replace(frames, blur_px=read_matrix(place / TRUTH / BLUR)[kept, 0])
+    return replace(capture, frames=frames)

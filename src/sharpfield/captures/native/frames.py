@@ -6,8 +6,9 @@ Frames in our own layout: a line each in `[frames] each`, and PNG files in `fram
 
 A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
 "none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
-defaults in brackets. `truth/depth.npy` and `truth/flow.npy` are of all frames, where known.
-`[frames] row_delay_us` (0) is that of a rolling shutter.
+defaults in brackets; `blur_px` is the true length of the motion blur, where known.
+`truth/depth.npy` and `truth/flow.npy` are of all frames, where known. `[frames] row_delay_us` (0)
+is that of a rolling shutter.
 """
 
 import re
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt16
+from jaxtyping import Float32, Float64, Shaped, UInt16
 
 from sharpfield.captures.native.trajectory import camera_table, read_camera
 from sharpfield.core.capture import Split
@@ -74,7 +75,7 @@ USES = {(True, False): "train", (False, True): "test", (True, True): "both", (Fa
 """What `use` says of a frame, by whether it is learned from and whether it is held out."""
 
 PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth")
+KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth", "blur_px")
 
 
 def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, Any]]:
@@ -107,6 +108,8 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
             table["truth"] = bool(frames.with_truth[i])
             if table["truth"]:
                 write_image(folder / TRUTH / file, frames.truth[i])
+        if frames.blur_px is not None:
+            table["blur_px"] = float(frames.blur_px[i])
         tables.append(table)
     for name in GEOMETRY:
         if (values := getattr(frames, name)) is not None:
@@ -140,9 +143,16 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
         encoding=about.text("encoding"),
         truth=truth,
         truth_known=known,
+        blur_px=_read_blur(tables),
         **_read_geometry(folder / TRUTH, images),
     )
     return frames, _split(tables), files
+
+
+def _read_blur(tables: Sequence[Table]) -> Float64[np.ndarray, "n"] | None:
+    if not any("blur_px" in table.values for table in tables):
+        return None
+    return np.array([table.number("blur_px") for table in tables])
 
 
 def _read_truth(

@@ -1,6 +1,6 @@
 """Our own layout. Writing a capture and reading it again gives exactly the same capture.
 
-capture.toml       camera, clock, depth bounds, tracks, exposures, split, notes: to be read
+capture.toml       camera, clock, depth bounds, tracks, exposures, split, what is known, notes
 frames/NAME.png    8 or 16 bit, grey or RGB
 truth/NAME.png     sharp images at mid-exposure, where known
 depth/NAME.png     what a depth camera measured, 16 bit, if there was one
@@ -12,8 +12,8 @@ points.npy         sparse scene points, if any
 notes.npz          notes that are arrays, if any
 cache/             derived; delete it when you like
 
-A capture that was just recorded has no poses yet. It is kept with a camera that stands still, and
-the note `poses = "unknown"` says that this is only a stand-in.
+A capture that was just recorded has no poses yet. It is stored with a camera that stands still, and
+`poses = "unknown"` in its table `[known]` says that this is only a placeholder.
 """
 
 from dataclasses import replace
@@ -30,6 +30,7 @@ from sharpfield.captures.native.frames import (
     write_depth,
     write_frames,
 )
+from sharpfield.captures.native.known import known_from_notes, known_table, read_known
 from sharpfield.captures.native.trajectory import (
     camera_table,
     read_camera,
@@ -56,8 +57,6 @@ DESCRIPTION = "capture.toml"
 EVENTS, TEST_EVENTS = "events.h5", "test_events.h5"
 POINTS = "points.npy"
 NOTES = "notes.npz"
-POSES, INTRINSICS, BOUNDS, UNKNOWN = "poses", "intrinsics", "bounds", "unknown"
-"""Notes that say of poses, focal length and depth bounds that nobody knows them yet."""
 
 NO_SPLIT = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
@@ -115,6 +114,7 @@ def describe(
         "camera": camera_table(capture.camera),
         "clock": {"origin_us": capture.clock.origin_us, "span_us": capture.clock.span_us},
         "trajectory": write_trajectory(capture.trajectory, folder),
+        "known": known_table(capture.known),
         "notes": {
             k: note.item() if isinstance(note, np.generic) else note
             for k, note in capture.notes.items()
@@ -146,16 +146,16 @@ def read(folder: Path) -> Capture:
 
 
 def expect_poses(capture: Capture, where: object) -> Capture:
-    """The capture itself, once it is known that its poses are no stand-in.
+    """The capture itself, if its poses are no placeholder.
 
     Raises:
         CaptureError: They are.
     """
-    if capture.notes.get(POSES) == UNKNOWN:
+    if capture.known.poses == "unknown":
         raise CaptureError(
-            "nobody knows yet where the camera was",
+            "the poses of the camera are unknown",
             where=where,
-            got=f'a note `{POSES} = "{UNKNOWN}"`',
+            got='`poses = "unknown"` in the table [known]',
             do="find the poses with `sharpfield poses`, or ingest the recording with --poses FILE",
         )
     return capture
@@ -164,9 +164,9 @@ def expect_poses(capture: Capture, where: object) -> Capture:
 def read_unposed(folder: Path) -> Capture:
     """Read a capture, whether its poses are known or not: what comes before training needs none.
 
-    Where they are not, `notes["poses"]` is "unknown" and the trajectory is a camera that stands
-    still at the origin. Likewise `notes["intrinsics"]` is "unknown" where the focal length is only
-    a stand-in (the image's width), and `notes["bounds"]` where `near` and `far` are.
+    Where they are not, `known.poses` is "unknown" and the trajectory is a camera that stands still
+    at the origin. Likewise `known.intrinsics` is "unknown" where the focal length is only a
+    placeholder (the image's width), and `known.bounds` where `near` and `far` are.
 
     Raises:
         CaptureError: Something is missing or malformed, or does not fit together.
@@ -175,7 +175,7 @@ def read_unposed(folder: Path) -> Capture:
     _expect_version(about)
     about.expect_only(
         *("format", "version", "name", "source", "near", "far", "camera", "clock"),
-        *("trajectory", "notes", "frames", "depth", "events"),
+        *("trajectory", "known", "notes", "frames", "depth", "events"),
     )
     timing = about.table("clock")
     clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
@@ -188,6 +188,12 @@ def read_unposed(folder: Path) -> Capture:
     notes = dict(about.table("notes", optional=True).values)
     if (folder / NOTES).exists():
         notes |= load_arrays(folder / NOTES)
+    if "known" in about.values:
+        known = read_known(about.table("known"))
+    else:  # an older capture
+        known, notes = known_from_notes(notes)
+        if frames is not None and "blur_px" in notes:
+            frames = replace(frames, blur_px=np.asarray(notes.pop("blur_px"), np.float64))
     trajectory = read_trajectory(about.table("trajectory"), folder, clock)
     streams = [
         _read_events(about, folder / file, camera, clock) if (folder / file).exists() else None
@@ -208,6 +214,7 @@ def read_unposed(folder: Path) -> Capture:
         points=load_array(folder / POINTS) if (folder / POINTS).exists() else None,
         name=about.text("name", folder.resolve().name),
         source=about.text("source", "native"),
+        known=known,
         notes=notes,
     )
 

@@ -82,7 +82,7 @@ def _write_views(folder: Path, name: str, capture: Capture, tracks: Int64[np.nda
     about = {
         "camera_angle_x": 2 * math.atan(0.5 * camera.width / camera.fx_px),
         "focal": camera.fx_px,
-        **{key: capture.notes[key] for key in THRESHOLDS},
+        **dict(zip(THRESHOLDS, _thresholds(capture), strict=True)),
         "frames": listed,
     }
     (folder / f"transforms_{name}.json").write_text(json.dumps(about, indent=1) + "\n")
@@ -108,7 +108,7 @@ def _sums(
 ) -> Float32[np.ndarray, "v k h w"]:
     """Signed sums of thresholds in each window of each view."""
     index, times = build(events), _times_us(capture).tolist()
-    off, on = (float(capture.notes[name]) for name in THRESHOLDS)
+    off, on = _thresholds(capture)
     size = {"width": events.width, "height": events.height}
     sums = np.empty((len(tracks), len(times) - 1, events.height, events.width), np.float32)
     for view, track in zip(sums, tracks.tolist(), strict=True):
@@ -116,6 +116,13 @@ def _sums(
             counts = window_image(index, start, end, track=track, **size)
             window[:] = on * counts[..., 1] - off * counts[..., 0]
     return sums
+
+
+def _thresholds(capture: Capture) -> tuple[float, float]:
+    """Negative and positive."""
+    known = capture.known.thresholds
+    assert known is not None, "checked before"
+    return known.negative, known.positive
 
 
 def _frames_of(capture: Capture, track: int) -> Int64[np.ndarray, "t"]:
@@ -148,9 +155,7 @@ def _expect_expressible(capture: Capture) -> None:
         "pixels that are not square": camera.fx_px != camera.fy_px,
         "images of 16 bits": frames.images.dtype != np.uint8,
         "rectified or coloured events": any(one.rectified or one.coloured for one in streams),
-        "events of unknown thresholds": not all(
-            isinstance(capture.notes.get(name), float) for name in THRESHOLDS
-        ),
+        "events of unknown thresholds": capture.known.thresholds is None,
     }
     found = [what for what, wrong in problems.items() if wrong]
     if found:

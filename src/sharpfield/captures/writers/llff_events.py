@@ -104,9 +104,8 @@ def _write_events(path: Path, capture: Capture, variant: Variant) -> None:
         kinds |= {"x": np.dtype(np.float32), "y": np.dtype(np.float32)}
     with h5py.File(path, "w") as file:
         file.attrs["tick_ns"] = 1000 // ticks
-        for name in THRESHOLDS:
-            if isinstance(capture.notes.get(name), float):
-                file.attrs[name] = capture.notes[name]
+        if (known := capture.known.thresholds) is not None:
+            file.attrs.update(zip(THRESHOLDS, (known.negative, known.positive), strict=True))
         rows = min(ROWS, max(len(events), 1))
         packing = {"chunks": (rows,), "compression": "gzip", "shuffle": True}
         columns = {

@@ -49,9 +49,8 @@ def _write_truth(capture: Capture, place: Path) -> None:
     if frames.truth is not None:
         for i in np.flatnonzero(frames.with_truth):
             write_image(place / f"{i}.png", np.asarray(frames.truth[i]))
-    blur = capture.notes.get("blur_px")
-    if isinstance(blur, np.ndarray):
-        _write_matrix(place / scannet.BLUR, blur[:, None])
+    if frames.blur_px is not None:
+        _write_matrix(place / scannet.BLUR, frames.blur_px[:, None])
 
 
 def _expect_representable(capture: Capture) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sharpfield.captures.read import read_unposed
-from sharpfield.core.capture import Capture
+from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, calibrate
 from sharpfield.preparation.doctor.agreement import check_agreement
@@ -111,8 +111,8 @@ def _with_thresholds(capture: Capture, checkup: Checkup) -> Capture:
         checkup.say("note", "thresholds", "contrast thresholds, by frames and events", got=got)
     if known is not None or made.explained <= EXPLAINS:
         return capture
-    notes = {"threshold_off": made.negative, "threshold_on": made.positive}
-    return replace(capture, notes=capture.notes | notes)
+    measured = Thresholds(made.negative, made.positive, "estimated")
+    return replace(capture, known=replace(capture.known, thresholds=measured))
 
 
 def _tried(checkup: Checkup, check: str, look: Callable[[], object]) -> bool:

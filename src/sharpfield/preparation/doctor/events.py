@@ -161,7 +161,7 @@ def check_light(capture: Capture, checkup: Checkup) -> None:
     white = np.mean(frames.images >= WHITE * frames.white)
     black = np.mean(frames.images <= BLACK * frames.white)
     # Rendered objects are laid on white.
-    if white > CLIPPED and capture.notes.get("background") != "white":
+    if white > CLIPPED and capture.known.background != "white":
         checkup.say(
             "error" if white > CLIPPED_BADLY else "warning",
             "frames-saturated",

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from sharpfield.captures.native.layout import INTRINSICS, UNKNOWN
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
@@ -75,7 +74,7 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
     got = f"median {given:.2f} px from the lines, {count} details of {len(matches)} pairs"
     off = abs(np.log(FACTORS[best])) > OFF_BY
     if given > FINE_PX and off and errors[best] < GAIN * given and errors[best] < POOR_PX:
-        unknown = capture.notes.get(INTRINSICS) == UNKNOWN
+        unknown = capture.known.intrinsics == "unknown"
         checkup.say(
             "warning" if unknown else "error",
             "focal-length",

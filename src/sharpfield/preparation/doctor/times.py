@@ -3,7 +3,6 @@
 import numpy as np
 
 from sharpfield.captures.clocks import THOUSAND
-from sharpfield.captures.native.layout import POSES, UNKNOWN
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.preparation.doctor.findings import Checkup
@@ -23,7 +22,7 @@ def check_units(capture: Capture, checkup: Checkup) -> bool:
     frames, events = capture.frames, capture.events
     if frames is None or events is None or not len(events):
         return True
-    if capture.notes.get("motion") == "unknown":
+    if capture.known.motion == "unknown":
         checkup.say("note", "times", "frames have made-up times, so events cannot be compared")
         return False
     spans = {
@@ -105,7 +104,7 @@ def _plausible(capture: Capture, checkup: Checkup) -> bool:
 
 def check_poses_known(capture: Capture, checkup: Checkup) -> bool:
     """Whether there are poses, without holes, for all that was recorded."""
-    if capture.notes.get(POSES) == UNKNOWN:
+    if capture.known.poses == "unknown":
         checkup.say(
             "warning",
             "poses-unknown",

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Shaped
 
 from sharpfield.core.camera import Camera
+from sharpfield.core.capture import Certainty
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.recordings.lens_files import (
@@ -68,6 +69,7 @@ class Geometry:
     """Position of each pixel of the event sensor; None if events keep their pixels."""
     separate: bool = False
     """Whether frames come from another sensor than events."""
+    intrinsics: Certainty = "known"
     notes: dict[str, str | float] = field(default_factory=dict[str, str | float])
 
     def image(self, image: Shaped[np.ndarray, "y x *c"], bayer: str) -> Shaped[np.ndarray, "h w d"]:
@@ -158,7 +160,7 @@ def _uncalibrated(size: Size, frames: Size, optics: Optics, where: object) -> Ge
         camera,
         frame_size=size if frames != size else None,
         separate=frames != size,
-        notes={"intrinsics": "unknown"},
+        intrinsics="unknown",
     )
 
 

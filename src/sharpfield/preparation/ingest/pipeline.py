@@ -15,7 +15,7 @@ import numpy as np
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_file import read_poses
-from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Note, Split
+from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Split, Thresholds
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import write_json
@@ -119,8 +119,8 @@ class _Ingest:
             taken, exposure, dropped = self._crop(taken, exposure, span)
             left |= dropped
         capture = self._capture(name, lens, taken, exposure, span)
-        notes = self._notes(lens, sieve, left, clock)
-        self._seal(replace(capture, notes=notes), taken)
+        known, notes = self._known(lens), self._notes(lens, sieve, left, clock)
+        self._seal(replace(capture, known=known, notes=notes), taken)
         return Ingested(
             events=0
             if found is None or sieve is None
@@ -130,7 +130,7 @@ class _Ingest:
             left_out=left,
             hot_pixels=0 if sieve is None else len(sieve.hot),
             clock=clock,
-            unknown=tuple(k for k, note in notes.items() if str(note) == native.UNKNOWN),
+            unknown=known.unknown,
         )
 
     def _survey(self) -> Survey:
@@ -357,8 +357,8 @@ class _Ingest:
 
     def _encoding(self) -> str:
         assert self._frames is not None
-        told = self._frames.notes.get("encoding")
-        return told or ("linear" if self._bayer(self._frames) else "gamma2.2")
+        raw = "linear" if self._bayer(self._frames) else "gamma2.2"
+        return self._frames.frame_encoding or raw
 
     def _trajectory(self, clock: Clock) -> Trajectory:
         if self._choices.scene.poses is None:
@@ -369,20 +369,25 @@ class _Ingest:
     def _notes(
         self, lens: Geometry, sieve: Sieve | None, left: dict[str, int], clock: str
     ) -> dict[str, Note]:
-        scene = self._choices.scene
         notes: dict[str, Note] = {**lens.notes}
-        if scene.poses is None:
-            notes[native.POSES] = native.UNKNOWN
-        if scene.near is None or scene.far is None:
-            notes[native.BOUNDS] = native.UNKNOWN
         if left:
             notes["left_out"] = ", ".join(f"{count} {kind}" for kind, count in left.items())
         if clock:
             notes["clock"] = clock
         if sieve is not None and len(sieve.hot):
             notes["hot_pixels"] = sieve.hot
-        told = {} if self._events is None else self._events.notes
-        return notes | {k: float(v) for k, v in told.items() if k.startswith("threshold_")}
+        return notes
+
+    def _known(self, lens: Geometry) -> Known:
+        scene = self._choices.scene
+        stated = None if self._events is None else self._events.thresholds
+        bounded = scene.near is not None and scene.far is not None
+        return Known(
+            poses="unknown" if scene.poses is None else "known",
+            intrinsics=lens.intrinsics,
+            bounds="known" if bounded else "unknown",
+            thresholds=None if stated is None else Thresholds(*stated),
+        )
 
     def _seal(self, capture: Capture, taken: WrittenFrames | None) -> None:
         """Write the description, and let the capture take its place."""

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float64, Int64
 
 from sharpfield.captures.layouts._photos import depth_bounds, fitted, same_camera
-from sharpfield.captures.native.layout import BOUNDS, INTRINSICS, POSES, UNKNOWN
 from sharpfield.captures.paths.pose_layouts import OuterPath
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
@@ -75,7 +74,6 @@ def attach(
         name: None if (held := getattr(capture, name)) is None else within(held, laid.path, laid)
         for name in ("events", "test_events")
     }
-    notes = {k: v for k, v in capture.notes.items() if k not in (POSES, BOUNDS)}
     made = replace(
         capture,
         trajectory=laid.path,
@@ -84,11 +82,12 @@ def attach(
         depth=None
         if capture.depth is None
         else replace(capture.depth, stored=capture.depth.stored[laid.kept]),
-        notes=notes | {"poses_from": f"a file ({path.layout})"},
+        known=replace(capture.known, poses="known", bounds="known"),
+        notes=capture.notes | {"poses_from": f"a file ({path.layout})"},
         **streams,
     )
     made = _with_model(made, path)
-    if bounds is None and capture.notes.get(BOUNDS) == UNKNOWN and path.model is None:
+    if bounds is None and capture.known.bounds == "unknown" and path.model is None:
         bounds = _seen_bounds(made)
     if bounds is not None:
         made = replace(made, near=bounds[0], far=bounds[1])
@@ -201,12 +200,18 @@ def _with_model(capture: Capture, path: OuterPath) -> Capture:
     if model is None or not len(model.points):
         return capture
     near, far = depth_bounds(model.points, model.poses, model.seen, where=capture.name)
-    camera, notes = capture.camera, dict(capture.notes)
-    if notes.get(INTRINSICS) == UNKNOWN:
+    camera = capture.camera
+    if capture.known.intrinsics == "unknown":
         shared = same_camera(model.cameras, model.names, where=capture.name)
         camera = fitted(shared, camera.width, camera.height, where=capture.name)
-        notes.pop(INTRINSICS)
-    return replace(capture, camera=camera, points=model.points, near=near, far=far, notes=notes)
+    return replace(
+        capture,
+        camera=camera,
+        points=model.points,
+        near=near,
+        far=far,
+        known=replace(capture.known, intrinsics="known"),
+    )
 
 
 def _seen_bounds(capture: Capture) -> tuple[float, float]:

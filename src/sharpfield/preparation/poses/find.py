@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from sharpfield.captures.native.layout import BOUNDS, INTRINSICS, POSES, UNKNOWN
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
@@ -168,7 +167,7 @@ def _instants(capture: Capture, source: Source) -> int:
 
 
 def _usual(capture: Capture) -> Intrinsics:
-    return "find" if capture.notes.get(INTRINSICS) == UNKNOWN else "given"
+    return "find" if capture.known.intrinsics == "unknown" else "given"
 
 
 def _moved(found: Map, change: Similarity) -> Map:
@@ -189,7 +188,6 @@ def _with_poses(
     good = good if good.any() else np.ones_like(good)
     near, far = np.percentile(depths(found)[good[found.sightings[:, 1]]], BOUNDS_PERCENT)
     unsure = np.setdiff1d(np.arange(len(capture.needed_frames)), sharp.frame[there])
-    notes = {k: v for k, v in capture.notes.items() if k not in (POSES, INTRINSICS, BOUNDS)}
     streams = {
         name: None if (held := getattr(capture, name)) is None else within(held, laid.path, laid)
         for name in ("events", "test_events")
@@ -206,7 +204,9 @@ def _with_poses(
         depth=None
         if capture.depth is None
         else replace(capture.depth, stored=capture.depth.stored[laid.kept]),
-        notes=notes | {"poses_from": f"structure from motion, {sharp.source}, {intrinsics} lens"},
+        known=replace(capture.known, poses="known", intrinsics="known", bounds="known"),
+        notes=capture.notes
+        | {"poses_from": f"structure from motion, {sharp.source}, {intrinsics} lens"},
         **streams,
     )
     return made, laid

@@ -134,4 +134,5 @@ def frames_of(
         truth_known=None if frames.truth_known is None else frames.truth_known[chosen],
         depth=None,
         flow=None if frames.flow is None else frames.flow[chosen],
+        blur_px=None if frames.blur_px is None else frames.blur_px[chosen],
     )

@@ -95,7 +95,8 @@ class DynamicModel(nn.Module):
         )
         settles = max(self.looks.late_from, self.scene.last_growth)
         self.guidance = cooldown(settles, recipe.steps, left=recipe.looks.fading)
-        self.floor = float(capture.notes.get("log_floor", FLOOR))
+        floor = capture.known.log_floor
+        self.floor = FLOOR if floor is None else floor
 
     @property
     def heaviest_step(self) -> int:

@@ -262,4 +262,4 @@ def align_events_to_rolling_shutter(capture: Capture) -> Capture:
 
 
 def _motion_unknown(capture: Capture) -> bool:
-    return capture.notes.get("motion") == "unknown" and capture.frames is not None
+    return capture.known.motion == "unknown" and capture.frames is not None

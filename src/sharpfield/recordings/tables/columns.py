@@ -34,15 +34,20 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
         _expect_unit(file)
         _expect_size(file)
         whole = _whole_numbers(file)
-        notes = {} if file.thresholds is None else _thresholds(file.thresholds)
-        size, bayer = file.size, file.bayer
+        size, bayer, thresholds = file.size, file.bayer, file.thresholds
 
     def events() -> Chunks:
         with open_file() as opened:
             yield from _chunks(opened, trouble.anew("events"), whole=whole)
 
     return Recording(
-        path, layout, size=size, events=events, bayer=bayer, trouble=trouble, notes=notes
+        path,
+        layout,
+        size=size,
+        events=events,
+        bayer=bayer,
+        thresholds=thresholds,
+        trouble=trouble,
     )
 
 
@@ -145,7 +150,3 @@ def _expect_size(file: EventFile) -> None:
             where=file.path,
             do="give width and height in pixels",
         )
-
-
-def _thresholds(known: tuple[float, float]) -> dict[str, str]:
-    return {"threshold_off": repr(known[0]), "threshold_on": repr(known[1])}

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8, Int16, Int32, Int64
 from numba import njit
 
-from sharpfield.core.capture import Note
+from sharpfield.core.capture import Known, Note, Thresholds
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.simulation.sensors.event_pixels import (
@@ -105,17 +105,19 @@ class EventPixels:
         on, off = self.pixels.on.reshape(self._size), self.pixels.off.reshape(self._size)
         return on.astype(np.float32), off.astype(np.float32)
 
+    def known(self) -> Known:
+        """What a capture knows about its event camera."""
+        sensor = self.sensor
+        return Known(
+            thresholds=Thresholds(sensor.threshold_off, sensor.threshold_on),
+            refractory_us=sensor.refractory_us,
+            log_floor=sensor.floor,
+        )
+
     def notes(self) -> dict[str, Note]:
-        """What a capture should say about its event camera."""
+        """The thresholds of each pixel, for the notes of a capture."""
         on, off = self.thresholds()
-        return {
-            "threshold_on": self.sensor.threshold_on,
-            "threshold_off": self.sensor.threshold_off,
-            "threshold_on_map": on,
-            "threshold_off_map": off,
-            "refractory_us": self.sensor.refractory_us,
-            "log_floor": self.sensor.floor,
-        }
+        return {"threshold_on_map": on, "threshold_off_map": off}
 
     def _follow(
         self, target: Float64[np.ndarray, "n"], light: Float32[np.ndarray, "h w"], gap_ns: int
