@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int8, Int64, Shaped
 
+from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 
@@ -102,8 +103,8 @@ class Recording:
     """Reads the trigger edges; None if the format has none."""
     bayer: str = ""
     """Colour filter tile of the raw sensor, e.g. "RGGB"; "" if mono or not known."""
-    thresholds: tuple[float, float] | None = None
-    """Contrast thresholds in natural log, negative and positive, where the file states them."""
+    thresholds: Thresholds | None = None
+    """Contrast thresholds, where the file states them."""
     frame_encoding: str = ""
     """How values of frames relate to light (see `core.frames.ENCODINGS`); "" if not known."""
     trouble: ReadLog = field(default_factory=ReadLog)

@@ -15,7 +15,7 @@ import numpy as np
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_file import read_poses
-from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Split, Thresholds
+from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import write_json
@@ -62,7 +62,7 @@ class Ingested:
     clock: str
     """How frames came to the clock of the events."""
     unknown: tuple[str, ...]
-    """What nobody knows yet."""
+    """What is unknown yet: poses, intrinsics, depth bounds."""
 
 
 def ingest(
@@ -119,8 +119,7 @@ class _Ingest:
             taken, exposure, dropped = self._crop(taken, exposure, span)
             left |= dropped
         capture = self._capture(name, lens, taken, exposure, span)
-        known, notes = self._known(lens), self._notes(lens, sieve, left, clock)
-        self._seal(replace(capture, known=known, notes=notes), taken)
+        self._seal(replace(capture, notes=self._notes(lens, sieve, left, clock)), taken)
         return Ingested(
             events=0
             if found is None or sieve is None
@@ -130,7 +129,7 @@ class _Ingest:
             left_out=left,
             hot_pixels=0 if sieve is None else len(sieve.hot),
             clock=clock,
-            unknown=known.unknown,
+            unknown=capture.known.unknown,
         )
 
     def _survey(self) -> Survey:
@@ -352,13 +351,14 @@ class _Ingest:
             events=events,
             split=Split(np.arange(0 if frames is None else len(frames)), np.zeros(0, np.int64)),
             name=name,
+            known=self._known(lens),
             source=" and ".join(dict.fromkeys(r.layout for r in (self._events, self._frames) if r)),
         )
 
     def _encoding(self) -> str:
         assert self._frames is not None
-        raw = "linear" if self._bayer(self._frames) else "gamma2.2"
-        return self._frames.frame_encoding or raw
+        raw = self._bayer(self._frames)
+        return self._frames.frame_encoding or ("linear" if raw else "gamma2.2")
 
     def _trajectory(self, clock: Clock) -> Trajectory:
         if self._choices.scene.poses is None:
@@ -380,13 +380,11 @@ class _Ingest:
 
     def _known(self, lens: Geometry) -> Known:
         scene = self._choices.scene
-        stated = None if self._events is None else self._events.thresholds
-        bounded = scene.near is not None and scene.far is not None
         return Known(
             poses="unknown" if scene.poses is None else "known",
             intrinsics=lens.intrinsics,
-            bounds="known" if bounded else "unknown",
-            thresholds=None if stated is None else Thresholds(*stated),
+            bounds="unknown" if None in (scene.near, scene.far) else "known",
+            thresholds=None if self._events is None else self._events.thresholds,
         )
 
     def _seal(self, capture: Capture, taken: WrittenFrames | None) -> None:
@@ -394,12 +392,10 @@ class _Ingest:
         tables = None
         if taken is not None and capture.frames is not None:
             exposure = capture.frames.exposure
+            shutter = zip(taken.names, exposure.open_us, exposure.close_us, strict=True)
             tables = [
-                {"name": name, "open_us": int(begin), "close_us": int(end), "track": 0}
-                | {"use": "train"}
-                for name, begin, end in zip(
-                    taken.names, exposure.open_us, exposure.close_us, strict=True
-                )
+                {"name": name, "open_us": int(begin), "close_us": int(end), "use": "train"}
+                for name, begin, end in shutter
             ]
         native.describe(capture, self._stage.capture, frames=tables)
         self._stage.finish()

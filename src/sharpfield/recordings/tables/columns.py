@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Int64, Shaped
 
+from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.chunks import expect_inside
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording
@@ -34,7 +35,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
         _expect_unit(file)
         _expect_size(file)
         whole = _whole_numbers(file)
-        size, bayer, thresholds = file.size, file.bayer, file.thresholds
+        size, bayer, stated = file.size, file.bayer, file.thresholds
 
     def events() -> Chunks:
         with open_file() as opened:
@@ -46,7 +47,7 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
         size=size,
         events=events,
         bayer=bayer,
-        thresholds=thresholds,
+        thresholds=None if stated is None else Thresholds(*stated),
         trouble=trouble,
     )
 
