@@ -369,11 +369,9 @@ class _Ingest:
     def _notes(
         self, lens: Geometry, sieve: Sieve | None, left: dict[str, int], clock: str
     ) -> dict[str, Note]:
-        notes: dict[str, Note] = {**lens.notes}
+        notes: dict[str, Note] = {**lens.notes} | ({"clock": clock} if clock else {})
         if left:
             notes["left_out"] = ", ".join(f"{count} {kind}" for kind, count in left.items())
-        if clock:
-            notes["clock"] = clock
         if sieve is not None and len(sieve.hot):
             notes["hot_pixels"] = sieve.hot
         return notes
