@@ -124,7 +124,7 @@ def test_no_pixels():
             {"lens": "brown", "distortion": (0.1,)},
             "CaptureError: unknown lens model or wrong number of distortion coefficients\n"
             "  got    'brown' with 1\n"
-            "  do     use one of {'pinhole': 0, 'brown': 5, 'fisheye': 4} (model: coefficients)",
+            "  do     use one of pinhole (0), brown (5), fisheye (4)",
         ),
     ],
 )

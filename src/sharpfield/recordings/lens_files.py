@@ -31,6 +31,7 @@ from yaml.constructor import ConstructorError
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
+from sharpfield.core.lenses import LENSES, lens_in_calibration
 
 HALF_PIXEL = 0.5
 """From the centre of the first pixel to its corner."""
@@ -41,9 +42,6 @@ SINGLE_CAMERA = "camera"
 MAX_BYTES, MAX_NESTING = 1 << 20, 32
 """Limits of a YAML file: a calibration is a page or two."""
 
-BROWN = ("radtan", "plumb_bob", "brown", "radial-tangential")
-FISHEYE = ("equidistant", "fisheye", "kannala_brandt")
-PINHOLE = ("none", "pinhole", "")
 SIZE_KEYS = ("image_width", "image_height")
 
 Pose = Float64[np.ndarray, "4 4"]
@@ -291,15 +289,16 @@ def _camera(
 def _lens(model: str, coefficients: list[float], where: object) -> tuple[str, tuple[float, ...]]:
     if not any(coefficients):
         return "pinhole", ()
-    if model in BROWN and len(coefficients) >= 4 and not any(coefficients[5:]):
-        return "brown", tuple((coefficients + [0.0])[:5])
-    if model in FISHEYE and len(coefficients) == 4:
-        return "fisheye", tuple(coefficients)
+    lens = lens_in_calibration(model)
+    count = len(lens.coefficients) if lens else 0
+    if lens and lens.fewest <= len(coefficients) and not any(coefficients[count:]):
+        return lens.name, lens.padded(coefficients[:count])
+    names = [name for lens in LENSES.working().values() for name in lens.calibration_names]
     raise CaptureError(
         "unknown lens model",
         where=where,
         got=f"{model} with {len(coefficients)} coefficients",
-        do=f"use one of {', '.join([*BROWN, *FISHEYE, *PINHOLE[:2]])}",
+        do=f"use one of {', '.join(name for name in names if name)}",
     )
 
 

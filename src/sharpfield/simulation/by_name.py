@@ -79,8 +79,8 @@ class RecordingOptions:
     """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
     rolling_shutter_ms: float = 0.0
     """How much later the last row of a frame is exposed than the first; scenes that stand still."""
-    lens: Literal["pinhole", "brown", "fisheye"] = "pinhole"
-    """A lens model; see `distortion`."""
+    lens: str = "pinhole"
+    """Lens model: pinhole, brown, fisheye, or one of an installed package."""
     distortion: tuple[float, ...] = ()
     """Its coefficients, as OpenCV's: k1 k2 p1 p2 k3 of brown, k1 k2 k3 k4 of fisheye."""
     walk: RoomOptions = ROOM_OPTIONS

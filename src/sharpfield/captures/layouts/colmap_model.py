@@ -19,19 +19,10 @@ from jaxtyping import Float64, Int64
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError
+from sharpfield.core.lenses import LENSES, ColmapModel, Lens
 from sharpfield.geometry import se3
 
-MODELS = {
-    "SIMPLE_PINHOLE": (0, 3),
-    "PINHOLE": (1, 4),
-    "SIMPLE_RADIAL": (2, 4),
-    "RADIAL": (3, 5),
-    "OPENCV": (4, 8),
-    "OPENCV_FISHEYE": (5, 8),
-}
-"""Camera models we know: COLMAP's number, and how many parameters."""
-
-NAMES = {number: name for name, (number, _) in MODELS.items()}
+INTRINSICS = ("f", "fx", "fy", "cx", "cy")
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "")
 """Where in a scene's folder a model may be."""
@@ -120,24 +111,31 @@ def camera_of(
     model: str, width: int, height: int, parameters: tuple[float, ...], *, where: object
 ) -> Camera:
     """Our camera for COLMAP's model name and parameters."""
-    if model not in MODELS or len(parameters) != MODELS[model][1]:
+    known, given = colmap_models(), {}
+    if model in known and len(parameters) == len(known[model][0].parameters):
+        given = dict(zip(known[model][0].parameters, parameters, strict=True))
+        beyond = set(given) - {*INTRINSICS, *known[model][1].coefficients}
+    if not given or any(given[name] for name in beyond):
         raise CaptureError(
             f"camera model {model} is not supported",
             where=where,
             got=f"{len(parameters)} parameters",
-            do=f"use one of {', '.join(MODELS)}, or undistort with `colmap image_undistorter`",
+            do=f"use one of {', '.join(known)}, or undistort with `colmap image_undistorter`",
         )
-    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        (focal, cx, cy), bent = parameters[:3], parameters[3:]
-        fx = fy = focal
-    else:
-        (fx, fy, cx, cy), bent = parameters[:4], parameters[4:]
-    if not any(bent) and model != "OPENCV_FISHEYE":
-        return Camera(width, height, fx, fy, cx, cy)
-    if model == "OPENCV_FISHEYE":
-        return Camera(width, height, fx, fy, cx, cy, "fisheye", tuple(bent))
-    brown = (*bent, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]  # k1, k2, p1, p2, k3; what is not given is zero
-    return Camera(width, height, fx, fy, cx, cy, "brown", brown)
+    lens = known[model][1]
+    fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
+    inner = (width, height, fx, fy, given["cx"], given["cy"])
+    distortion = tuple(given.get(name, 0.0) for name in lens.coefficients)
+    if lens.zero_is_pinhole and not any(distortion):
+        return Camera(*inner)
+    return Camera(*inner, lens.name, distortion)
+
+
+def colmap_models() -> dict[str, tuple[ColmapModel, Lens]]:
+    """COLMAP's camera models, each with the lens that covers it."""
+    return {
+        theirs.name: (theirs, lens) for lens in LENSES.working().values() for theirs in lens.colmap
+    }
 
 
 def _world_from_camera(images: list[_Image]) -> Float64[np.ndarray, "n 3 4"]:
@@ -190,8 +188,9 @@ def _binary_cameras(path: Path) -> dict[int, Camera]:
     data, cameras = _Bytes(path), {}
     for _ in range(data.take("Q")[0]):
         number, model, width, height = data.take("IiQQ")
-        name = NAMES.get(model, f"number {model}")
-        count = MODELS[name][1] if name in MODELS else 0
+        known = {theirs.number: theirs for theirs, _ in colmap_models().values()}
+        name = known[model].name if model in known else f"number {model}"
+        count = len(known[model].parameters) if model in known else 0
         cameras[number] = camera_of(name, width, height, data.take(f"{count}d"), where=path)
     return cameras
 

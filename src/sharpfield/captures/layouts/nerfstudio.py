@@ -37,16 +37,10 @@ from sharpfield.captures.layouts._transforms import (
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
+from sharpfield.core.lenses import LENSES, PINHOLE
 from sharpfield.geometry.normalise import focus
 from sharpfield.storage.images import read_images
 from sharpfield.storage.ply import columns, read_ply
-
-LENSES = {
-    "PINHOLE": ("pinhole", ()),
-    "OPENCV": ("brown", ("k1", "k2", "p1", "p2", "k3")),
-    "OPENCV_FISHEYE": ("fisheye", ("k1", "k2", "k3", "k4")),
-}
-"""Camera models: our lens, and the keys of its distortion."""
 
 NEAR, FAR = 0.1, 10.0
 """Guessed depth bounds, as multiples of the cameras' distance from what they look at."""
@@ -131,22 +125,23 @@ def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.nda
 
 def _camera(content: dict[str, Any], path: Path) -> Camera:
     model = content.get("camera_model", "OPENCV")
-    if model not in LENSES:
+    lenses = {lens.nerfstudio: lens for lens in LENSES.working().values() if lens.nerfstudio}
+    if model not in lenses:
         raise CaptureError(
             "camera model is not supported",
             where=path,
             got=model,
-            do=f"use one of {', '.join(LENSES)}, or undistort the images",
+            do=f"use one of {', '.join(lenses)}, or undistort the images",
         )
-    lens, keys = LENSES[model]
-    bent = tuple(number({key: 0.0, **content}, key, path) for key in keys)
-    if not any(bent) and lens == "brown":
-        lens, bent = "pinhole", ()
+    lens = lenses[model]
+    distortion = tuple(number({key: 0.0, **content}, key, path) for key in lens.coefficients)
+    if lens.zero_is_pinhole and not any(distortion):
+        lens, distortion = PINHOLE, ()
     fx = number(content, "fl_x", path)
     fy = number({"fl_y": fx, **content}, "fl_y", path)
     cx, cy = number(content, "cx", path), number(content, "cy", path)
     width, height = round(number(content, "w", path)), round(number(content, "h", path))
-    return Camera(width, height, fx, fy, cx, cy, lens, bent)
+    return Camera(width, height, fx, fy, cx, cy, lens.name, distortion)
 
 
 def _split(content: dict[str, Any], names: list[str], path: Path) -> Split:

@@ -34,6 +34,7 @@ from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.frames import Exposure, Frames
+from sharpfield.core.lenses import PINHOLE, lens_in_calibration
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.arrays import load_arrays
@@ -42,8 +43,8 @@ from sharpfield.storage.images import SUFFIXES, read_images
 
 EVENTS, POSES, CALIBRATION = "raw_events.npz", "camera_poses.npz", "camera_calibration.npz"
 
-LENSES = {"plumb_bob": ("brown", (0.0,)), "equidistant": ("fisheye", ())}
-"""Distortion models: our lens, and the coefficients that follow their four."""
+DISTORTION = ("plumb_bob", "equidistant")
+"""Distortion models of this layout, each with four coefficients."""
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
@@ -96,21 +97,21 @@ def _camera(calibration: Arrays, path: Path) -> Camera:
     matrix = np.asarray(calibration["intrinsics"], np.float64)
     bent = np.atleast_1d(np.asarray(calibration.get("distortion_params", []), np.float64))
     model = str(calibration.get("distortion_model", ""))
-    lens, distortion = "pinhole", ()
+    lens, distortion = PINHOLE, ()
     if bent.size and bent.any():
-        if model not in LENSES or bent.shape != (4,):
+        lens = lens_in_calibration(model)
+        if lens is None or bent.shape != (4,) or lens.fewest != 4:
             raise CaptureError(
                 "distortion model is not supported",
                 where=path,
                 got=f"{model!r} with {bent.size} coefficients",
-                do=f"use one of {', '.join(LENSES)} with 4, or undistort the events",
+                do=f"use one of {', '.join(DISTORTION)} with 4, or undistort the events",
             )
-        lens, more = LENSES[model]
-        distortion = (*bent.tolist(), *more)
+        distortion = lens.padded(bent.tolist())
     width, height = (int(calibration[name].item()) for name in ("img_width", "img_height"))
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
     cx, cy = float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5
-    return Camera(width, height, fx, fy, cx, cy, lens, distortion)
+    return Camera(width, height, fx, fy, cx, cy, lens.name, distortion)
 
 
 def _trajectory(path: Path) -> Stamped:

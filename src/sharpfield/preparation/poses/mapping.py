@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 from sharpfield.captures.layouts.colmap_model import camera_of
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError, need
+from sharpfield.core.lenses import LENSES
 from sharpfield.storage.images import write_image
 
 Intrinsics = Literal["given", "refine", "find"]
@@ -30,8 +31,7 @@ Lens = Literal["pinhole", "radial", "brown", "fisheye"]
 FOUND_MODELS = {
     "pinhole": "SIMPLE_PINHOLE",
     "radial": "SIMPLE_RADIAL",
-    "brown": "OPENCV",
-    "fisheye": "OPENCV_FISHEYE",
+    **{name: LENSES[name].colmap[0].name for name in ("brown", "fisheye")},
 }
 """COLMAP's models of the lenses that can be found."""
 
@@ -264,14 +264,14 @@ def _parameters(task: LensTask) -> tuple[str, list[float]]:
     inner = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
     if camera.lens == "pinhole" and task.intrinsics == "refine":
         return "SIMPLE_PINHOLE", [(camera.fx_px + camera.fy_px) / 2, camera.cx_px, camera.cy_px]
-    if camera.lens == "pinhole":
-        return "PINHOLE", inner
-    if camera.lens == "fisheye":
-        return "OPENCV_FISHEYE", [*inner, *camera.distortion]
-    *four, third = camera.distortion
-    if third == 0:
-        return "OPENCV", [*inner, *four]
-    return "FULL_OPENCV", [*inner, *four, third, 0.0, 0.0, 0.0]
+    lens = LENSES[camera.lens]
+    given = dict(zip(lens.coefficients, camera.distortion, strict=True))
+    needed = {name for name, value in given.items() if value}
+    for theirs in lens.colmap:
+        bent = theirs.parameters[len(inner) :]
+        if theirs.parameters[:2] == ("fx", "fy") and needed <= {*bent}:
+            return theirs.name, [*inner, *[given.get(name, 0.0) for name in bent]]
+    raise CaptureError("COLMAP has no camera model for the lens", got=camera.lens)
 
 
 def _map(made: Any, count: int, task: LensTask) -> Map:
