@@ -197,7 +197,11 @@ def test_published_observations_lie_where_the_points_project(samples):
 def test_rational_distortion_is_refused():
     """FULL_OPENCV is read as long as its k4, k5 and k6, which we lack, are zero."""
     inner = (50.0, 60.0, 40.0, 30.0)
-    found = camera_of("FULL_OPENCV", 80, 60, (*inner, 1.0, 2.0, 3.0, 4.0, 5.0, 0.0, 0.0, 0.0), where="x")
+    found = camera_of(
+        "FULL_OPENCV", 80, 60, (*inner, 1.0, 2.0, 3.0, 4.0, 5.0, 0.0, 0.0, 0.0), where="x"
+    )
     assert (found.lens, found.distortion) == ("brown", (1, 2, 3, 4, 5))
     with pytest.raises(CaptureError, match="FULL_OPENCV is not supported"):
-        camera_of("FULL_OPENCV", 80, 60, (*inner, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.0, 0.0), where="x")
+        camera_of(
+            "FULL_OPENCV", 80, 60, (*inner, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.0, 0.0), where="x"
+        )
