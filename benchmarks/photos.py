@@ -16,7 +16,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.read import read
 from sharpfield.captures.summary import downscaled
-from sharpfield.evaluation.evaluate import Measuring, evaluate
+from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
 from sharpfield.recipes.choose import prepared
 from sharpfield.runs.config import RunConfig
@@ -57,9 +57,9 @@ def _row(name: str, run: Path) -> Row:
     opened = open_run(run, capture=None, device="cpu")
     before = evaluate(opened.model, opened.capture, run)
     begin = aligned_poses(opened.model, opened.capture)
-    found = refine_poses(opened.model, opened.capture, how=REFINED, start=begin)
-    how = Measuring(poses=found.poses, stated=found.protocol)
-    after = evaluate(opened.model, opened.capture, run, measuring=how)
+    found = refine_poses(opened.model, opened.capture, options=REFINED, start=begin)
+    how = EvaluationOptions(poses=found.poses, stated=found.protocol)
+    after = evaluate(opened.model, opened.capture, run, options=how)
     return {
         "recipe": name,
         "psnr": before["mean"]["psnr"],

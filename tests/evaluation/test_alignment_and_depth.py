@@ -5,7 +5,12 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.evaluation.alignment_and_depth import DARK, aligned_psnr, depth_error, distances
+from sharpfield.evaluation.alignment_and_depth import (
+    DARK,
+    aligned_psnr,
+    distances,
+    scaled_depth_error,
+)
 
 CAMERA = Camera(9, 7, 6.0, 6.0, 4.5, 3.5)
 
@@ -32,24 +37,24 @@ def test_scale_of_depth_is_left_open_but_common_to_all_views():
     near, far = np.full((3, 4), 2.0, np.float32), np.full((3, 4), 6.0, np.float32)
     solid = [torch.ones(3, 4)] * 2
     drawn = [torch.from_numpy(near) * 5, torch.from_numpy(far) * 5]
-    assert depth_error(drawn, solid, [near, far]) == pytest.approx(0, abs=1e-6)
-    assert depth_error([drawn[0], drawn[0]], solid, [near, far]) > 0.3
+    assert scaled_depth_error(drawn, solid, [near, far]) == pytest.approx(0, abs=1e-6)
+    assert scaled_depth_error([drawn[0], drawn[0]], solid, [near, far]) > 0.3
 
 
 def test_only_pixels_with_a_true_depth_count_and_clear_ones_count_as_missed():
     truth = np.array([[1.0, 2.0, np.inf, 0.0]], np.float32)
     drawn = [torch.tensor([[1.0, 2.0, 9.0, 9.0]])]
-    assert depth_error(drawn, [torch.ones(1, 4)], [truth]) == pytest.approx(0)
+    assert scaled_depth_error(drawn, [torch.ones(1, 4)], [truth]) == pytest.approx(0)
     clear = torch.tensor([[1.0, 0.2, 1.0, 1.0]])
-    assert depth_error(drawn, [clear], [truth]) == pytest.approx(0.5)
-    assert depth_error(drawn, [0 * clear], [truth]) == 1
-    assert depth_error(drawn, [clear], [np.full((1, 4), np.inf, np.float32)]) is None
+    assert scaled_depth_error(drawn, [clear], [truth]) == pytest.approx(0.5)
+    assert scaled_depth_error(drawn, [0 * clear], [truth]) == 1
+    assert scaled_depth_error(drawn, [clear], [np.full((1, 4), np.inf, np.float32)]) is None
 
 
 def test_errors_of_a_pixel_are_at_most_one():
     truth = np.ones((1, 5), np.float32)
     drawn = [torch.tensor([[1.0, 1.0, 1.0, 1.0, 100.0]])]
-    assert depth_error(drawn, [torch.ones(1, 5)], [truth]) == pytest.approx(0.2)
+    assert scaled_depth_error(drawn, [torch.ones(1, 5)], [truth]) == pytest.approx(0.2)
 
 
 def test_distance_is_depth_in_the_middle_and_more_at_the_border():

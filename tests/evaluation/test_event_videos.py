@@ -6,9 +6,9 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sharpfield.evaluation.evaluate import evaluate
 from sharpfield.evaluation.event_videos import GAP_PX, WINDOWS, event_videos, events_section
-from sharpfield.evaluation.report import Story, write_report
+from sharpfield.evaluation.measure import evaluate
+from sharpfield.evaluation.report import RunDescription, write_report
 from tests.evaluation.test_event_scores import Scene
 from tests.evaluation.test_report import checked
 from tests.recipes.moving import tiny_moving
@@ -47,7 +47,7 @@ def test_the_report_plays_it(tmp_path: Path):
     moving = tiny_moving()
     metrics = evaluate(Scene(moving, 1.0), moving, tmp_path)
     assert [one["video"] for one in metrics["events"]["videos"]] == ["renders/events/03.mp4"]
-    told = checked(write_report(tmp_path, moving, metrics, Story("a moving scene")))
+    told = checked(write_report(tmp_path, moving, metrics, RunDescription("a moving scene")))
     assert sum(one.startswith("data:video/mp4;base64,") for one in told.references) == 1
     for text in ("Held-out event cameras", "Camera 3", "event PSNR (dB)", "1/32 of the capture"):
         assert text in told.text, text
@@ -56,5 +56,5 @@ def test_the_report_plays_it(tmp_path: Path):
 def test_without_held_out_events_there_is_no_video(tmp_path: Path):
     still = replace(tiny_moving(), test_events=None)
     assert event_videos(Scene(still, 1.0), still, tmp_path) == []
-    assert events_section(tmp_path, {"mean": {}}) == ""
+    assert events_section(tmp_path, {"mean": {}}) is None
     assert not list(tmp_path.iterdir())

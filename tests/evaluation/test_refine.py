@@ -6,7 +6,12 @@ import torch
 
 from sharpfield.core.capture import Clock, Split
 from sharpfield.core.errors import OptionError
-from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
+from sharpfield.evaluation.refine import (
+    Refinement,
+    aligned_poses,
+    refine_poses,
+    training_pose_errors,
+)
 from sharpfield.geometry import se3
 from sharpfield.geometry.normalise import moved
 from sharpfield.geometry.space import Similarity
@@ -35,7 +40,7 @@ def angle(one, other):
 def refined():
     model = Sky(capture())
     start = {f: turned(pose, (0.02, -0.01, 0.015)) for f, pose in own_poses(capture()).items()}
-    return model, start, refine_poses(model, capture(), how=QUICK, start=start)
+    return model, start, refine_poses(model, capture(), options=QUICK, start=start)
 
 
 def test_poses_come_back_to_where_the_images_were_taken(refined):
@@ -63,7 +68,7 @@ def test_the_choice_is_stated(refined):
 def test_it_never_ends_below_where_it_began():
     """At the true pose with a wild rate, every step makes things worse."""
     wild = Refinement(steps=4, pixels=50, rate=0.3, every=2)
-    found = refine_poses(Sky(capture()), capture(), how=wild)
+    found = refine_poses(Sky(capture()), capture(), options=wild)
     assert found.after == found.before
     for frame, truth in own_poses(capture()).items():
         torch.testing.assert_close(found.poses[frame], truth)
@@ -74,22 +79,24 @@ def test_a_model_in_colour_is_refined_against_grey_frames():
     frames = one.needed_frames
     middle = {"images": frames.images[..., 1:2], "truth": frames.truth[..., 1:2]}
     grey = replace(one, frames=replace(frames, **middle))
-    found = refine_poses(Sky(grey), grey, how=replace(QUICK, steps=2, every=1))
+    found = refine_poses(Sky(grey), grey, options=replace(QUICK, steps=2, every=1))
     assert all(found.after[frame] >= found.before[frame] > 5 for frame in TEST)
 
 
 def test_without_full_renders_the_last_pose_is_taken():
     model = Sky(capture())
     blind = replace(QUICK, every=0, steps=3)
-    found = refine_poses(model, capture(), how=blind)
+    found = refine_poses(model, capture(), options=blind)
     assert found.before == found.after == {}
     assert angle(found.poses[4], own_poses(capture())[4]) > 1e-4
     assert found.protocol["pose_refinement"]["chosen"] == "pose after the last step"
 
 
 def test_the_gradient_does_not_depend_on_how_many_rays_fit():
-    whole = refine_poses(Sky(capture()), capture(), how=replace(QUICK, steps=3, every=0))
-    parts = refine_poses(Sky(capture()), capture(), how=replace(QUICK, steps=3, every=0, rays=64))
+    whole = refine_poses(Sky(capture()), capture(), options=replace(QUICK, steps=3, every=0))
+    parts = refine_poses(
+        Sky(capture()), capture(), options=replace(QUICK, steps=3, every=0, rays=64)
+    )
     for frame in TEST:
         torch.testing.assert_close(parts.poses[frame], whole.poses[frame], atol=1e-5, rtol=0)
 
@@ -97,7 +104,8 @@ def test_the_gradient_does_not_depend_on_how_many_rays_fit():
 def test_the_seed_decides():
     short = replace(QUICK, steps=5, every=0)
     one, same, other = (
-        refine_poses(Sky(capture()), capture(), how=short, seed=seed).poses[4] for seed in (1, 1, 2)
+        refine_poses(Sky(capture()), capture(), options=short, seed=seed).poses[4]
+        for seed in (1, 1, 2)
     )
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
@@ -110,7 +118,7 @@ def test_views_far_off_draw_pixels_where_the_error_is(monkeypatch):
     monkeypatch.setattr(model, "render", lambda rays: (seen.append(len(rays)), render(rays))[1])
     start = {4: turned(own_poses(capture())[4], (0.3, 0.2, 0.0))}
     hard = replace(QUICK, steps=20, every=20, hard_psnr=50.0)
-    found = refine_poses(model, capture(), how=hard, start=start)
+    found = refine_poses(model, capture(), options=hard, start=start)
     assert seen.count(200) == 2 * 20  # two views
     assert found.after[4] > found.before[4]
 
@@ -118,7 +126,9 @@ def test_views_far_off_draw_pixels_where_the_error_is(monkeypatch):
 def test_progress_is_told():
     told = []
     short = replace(QUICK, steps=3, every=0)
-    refine_poses(Sky(capture()), capture(), how=short, progress=lambda *state: told.append(state))
+    refine_poses(
+        Sky(capture()), capture(), options=short, progress=lambda *state: told.append(state)
+    )
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -159,3 +169,23 @@ def test_what_cannot_be_refined():
     nothing = replace(capture(), split=Split(np.arange(6), np.zeros(0, np.int64)))
     with pytest.raises(OptionError, match="no frame is held out"):
         refine_poses(Sky(nothing), nothing)
+
+
+def test_refined_training_poses_are_compared_with_the_captures():
+    still = capture()
+    assert training_pose_errors(Sky(still), still) is None, "poses that did not move"
+    rng = np.random.default_rng(0)
+    poses = still.trajectory.poses.copy()
+    poses[:, :, 3] += 0.01 * rng.standard_normal((len(poses), 3))
+    moved = replace(still, trajectory=Stamped(still.trajectory.times_us, poses, still.clock))
+    found = training_pose_errors(Sky(moved), still)
+    assert found is not None and found["frames"] == len(still.split.train)
+    assert 0.001 < found["absolute"]["translation"] < 0.03
+    assert found["relative"]["rotation_deg"] >= 0
+
+
+def test_another_world_is_no_error():
+    still = capture()
+    doubled = still.trajectory.poses * np.array([1, 1, 1, 2.0])
+    other = replace(still, trajectory=Stamped(still.trajectory.times_us, doubled, still.clock))
+    assert training_pose_errors(Sky(other), still) is None

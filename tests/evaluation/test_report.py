@@ -1,5 +1,4 @@
 import json
-import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,15 +10,14 @@ from sharpfield.core.capture import Known, Split
 from sharpfield.core.events import merged
 from sharpfield.core.paper import Paper
 from sharpfield.evaluation import report
-from sharpfield.evaluation.evaluate import Measuring, evaluate
-from sharpfield.evaluation.report import Story, flat, input_name, write_report
-from sharpfield.report import page
-from sharpfield.report.capture import _strip
-from sharpfield.report.page import Look, embedded
+from sharpfield.evaluation.measure import EvaluationOptions, evaluate
+from sharpfield.evaluation.report import RunDescription, flat, input_name, write_report
+from sharpfield.report.capture import capture_section
+from sharpfield.report.page import ImageEncoding
 from tests.evaluation.fake import Sky, capture
 
 PAPER = Paper("key2024", "A method & more", "@inproceedings{key2024}", ("It is <better>.",))
-STORY = Story("the sky", PAPER, {"seed": 0, "volume": {"samples": (64, 64)}})
+STORY = RunDescription("the sky", PAPER, {"seed": 0, "volume": {"samples": (64, 64)}})
 
 
 class Checker(HTMLParser):
@@ -65,7 +63,7 @@ def checked(path: Path) -> Checker:
     assert all(r.startswith(("data:image/", "data:video/", "#")) for r in checker.references)
     assert len(checker.ids) == len(set(checker.ids))
     assert all(image["alt"] for image in checker.images)
-    assert path.stat().st_size < report.BUDGET_BYTES
+    assert path.stat().st_size < report.LARGEST_BYTES
     return checker
 
 
@@ -107,7 +105,7 @@ def test_a_whole_run_is_told(tmp_path: Path):
 )
 def test_what_a_capture_lacks_is_left_out(tmp_path: Path, lacking, text: str):
     metrics = evaluate(Sky(lacking), lacking, tmp_path)
-    told = checked(write_report(tmp_path, lacking, metrics, Story("odd")))
+    told = checked(write_report(tmp_path, lacking, metrics, RunDescription("odd")))
     assert text in told.text or text == "without"
     assert "brighter" in told.text or lacking.events is None
 
@@ -123,7 +121,7 @@ def test_a_gain_over_the_blurry_input_is_told_only_where_it_is_blurry(tmp_path: 
     sharp = replace(capture(), split=Split(np.array([0, 4]), np.array([1])))
     for one, told in ((capture(), True), (sharp, False)):
         metrics = evaluate(Sky(one), one, tmp_path)
-        page_text = checked(write_report(tmp_path, one, metrics, Story("input"))).text
+        page_text = checked(write_report(tmp_path, one, metrics, RunDescription("input"))).text
         assert ("over the blurry input" in page_text) == told
 
 
@@ -134,14 +132,14 @@ def test_events_are_shown_of_the_camera_whose_frame_is_shown():
         replace(part, track=np.full(len(part), k, np.int16), tracks=2)
         for k, part in enumerate((events, other))
     ]
-    alone, rig = _strip(one)[1], _strip(replace(one, events=merged(pair)))[1]
+    alone, rig = (capture_section(of).images[1] for of in (one, replace(one, events=merged(pair))))
     np.testing.assert_array_equal(rig.pixels, alone.pixels)
 
 
 def test_events_alone_are_said_to_be_aligned(tmp_path: Path):
     blind = capture().without(frames=True)
-    metrics = evaluate(Sky(blind), capture(), tmp_path, measuring=Measuring(train_views=1))
-    told = checked(write_report(tmp_path, capture(), metrics, Story("blind")))
+    metrics = evaluate(Sky(blind), capture(), tmp_path, options=EvaluationOptions(train_views=1))
+    told = checked(write_report(tmp_path, capture(), metrics, RunDescription("blind")))
     assert "aligned to the references" in told.text
 
 
@@ -155,21 +153,9 @@ def test_metrics_from_the_file_make_the_same_page(tmp_path: Path):
 def test_a_page_over_budget_gets_smaller_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     metrics = evaluate(Sky(capture()), capture(), tmp_path)
     large = write_report(tmp_path, capture(), metrics, STORY).stat().st_size
-    monkeypatch.setattr(report, "LOOKS", (Look(40, 90), Look(20, 30)))
-    monkeypatch.setattr(report, "BUDGET_BYTES", large - 1000)
+    monkeypatch.setattr(report, "ENCODINGS", (ImageEncoding(40, 90), ImageEncoding(20, 30)))
+    monkeypatch.setattr(report, "LARGEST_BYTES", large - 1000)
     assert write_report(tmp_path, capture(), metrics, STORY).stat().st_size < large - 1000
-
-
-def test_the_slider_can_be_worked_from_the_keyboard():
-    script = page.page("title", "")
-    assert '<input type="range"' in script and "aria-label" in script
-    assert not re.search(r"https?://", script)
-
-
-def test_images_are_shrunk_not_enlarged():
-    noise = np.random.default_rng(0).integers(0, 255, (60, 90, 3), np.uint8)
-    sizes = [len(embedded(noise, Look(px, 80))) for px in (30, 90, 400)]
-    assert sizes[0] < sizes[1] == sizes[2]
 
 
 def test_nested_settings_get_dotted_names():

@@ -12,7 +12,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.protocols import Growing, Model
 from sharpfield.core.rays import Rays, Views
-from sharpfield.evaluation.event_scores import SeesEvents
+from sharpfield.evaluation.event_scores import HasLogLight
 from sharpfield.geometry.normalise import centred
 from sharpfield.initialisation.moving import backdrop, hull_between
 from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
@@ -161,7 +161,7 @@ def test_the_backdrop_is_what_cameras_see_most_of_the_time():
 
 def test_it_is_a_model_that_grows_and_draws_views():
     model = small().build(tiny_moving(), 0)
-    assert isinstance(model, Model | Growing | ViewRenderer | SeesEvents)
+    assert isinstance(model, Model | Growing | ViewRenderer | HasLogLight)
     with pytest.raises(OptionError, match="draws whole views"):
         model.render(Rays(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1), torch.ones(1)))
 

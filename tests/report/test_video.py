@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.report.video import video, write_video
+from sharpfield.report.video import open_video, write_video
 from sharpfield.storage.images import list_images, read_images
 
 
@@ -48,7 +48,7 @@ def test_a_folder_gets_the_exact_images(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.mp4", "frames"])
 def test_a_video_that_breaks_off_leaves_nothing(tmp_path, name):
-    with pytest.raises(KeyboardInterrupt), video(tmp_path / name) as write:
+    with pytest.raises(KeyboardInterrupt), open_video(tmp_path / name) as write:
         write(next(images()))
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -64,5 +64,5 @@ def test_other_files_are_not_replaced(tmp_path):
 def test_options_that_make_no_video(tmp_path):
     with pytest.raises(OptionError, match="unknown kind of video"):
         write_video(tmp_path / "a.avi", images())
-    with pytest.raises(OptionError, match="positive rate"):
+    with pytest.raises(OptionError, match="positive frame rate"):
         write_video(tmp_path / "a.mp4", images(), rate=0.0)

@@ -11,9 +11,10 @@ from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import Device, Size, parse_size, screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
+from sharpfield.evaluation.tables import methods_table
 from sharpfield.preparation.deblur import DeblurOptions, deblur
 from sharpfield.recipes.choose import prepared
-from sharpfield.report.tables import markdown, methods_table
+from sharpfield.report.tables import markdown
 from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start

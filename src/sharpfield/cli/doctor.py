@@ -13,7 +13,7 @@ from sharpfield.cli.arguments import screen
 from sharpfield.core.files import write_json
 from sharpfield.preparation.doctor.doctor import examine_path
 from sharpfield.preparation.doctor.findings import Checkup
-from sharpfield.preparation.doctor.page import verdict, write_page
+from sharpfield.preparation.doctor.page import verdict, write_doctor_page
 from sharpfield.storage.images import write_image
 
 FINDINGS, PAGE = "doctor.json", "doctor.html"
@@ -45,7 +45,7 @@ def doctor(
         write_json(out / FINDINGS, about)
         for number, pixels in enumerate(checkup.images.values()):
             write_image(out / f"image_{number}.png", pixels)
-        write_page(out / PAGE, checkup, held)
+        write_doctor_page(out / PAGE, checkup, held)
         if not json:
             screen().print(f"The page is {out / PAGE}", soft_wrap=True)
     if checkup.has("error"):

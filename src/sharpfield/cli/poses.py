@@ -18,7 +18,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.files import write_json
 from sharpfield.preparation.poses.external import Mount, attach, known_at
 from sharpfield.preparation.poses.find import PoseOptions, find_poses
-from sharpfield.preparation.poses.report import as_text, summary, write_page
+from sharpfield.preparation.poses.report import as_text, summary, write_poses_page
 from sharpfield.storage.arrays import expect_replaceable
 
 REPORT, PAGE = "poses.json", "poses.html"
@@ -83,7 +83,7 @@ def poses(
     native.write(replace(found.capture, name=out.name), out)
     about = summary(original, found)
     write_json(out / REPORT, about)
-    write_page(out / PAGE, original, found, about)
+    write_poses_page(out / PAGE, original, found, about)
     console = screen()
     console.print(as_text(about), soft_wrap=True)
     console.print(f"The capture with poses is in {out}; open {out / PAGE}", soft_wrap=True)

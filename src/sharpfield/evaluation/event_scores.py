@@ -8,12 +8,13 @@ Source: EvDNeRF (WACV 2024) and its released evaluation for PSNR, SSIM and MAE o
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
@@ -23,40 +24,149 @@ from sharpfield.core.tone import luma
 from sharpfield.events.image import window_image
 from sharpfield.events.index import EventIndex
 from sharpfield.events.threshold import thresholds_of
+from sharpfield.formation.response import FLOOR
 from sharpfield.metrics.image import ssim
+from sharpfield.metrics.registry import Metric
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.storage.event_cache import event_index
 
 WINDOWS = 8
 """Windows of each camera, evenly spread."""
 LENGTHS = (1 / 32, 1 / 128)
-"""Of the windows, in shares of the capture: the longest of the paper's, and the shortest."""
-FLOOR = 1e-5
-"""Light added before the logarithm, for models that do not say what their event camera sees."""
-MOST = 20.0
-"""Counts beyond this are taken as this where the range of a measure is fixed."""
-
-DEFINITIONS = {
-    "event_psnr": "dB; peak is twice the largest recorded change of all windows (as published)",
-    "event_mae": "mean absolute difference, natural log",
-    "event_ssim": "on event frames mapped from -M...M to 0...1, M the largest recorded change",
-    "count_psnr": f"dB, in events, peak {2 * MOST:g}, both clipped to +-{MOST:g}",
-    "count_mae_busy": "mean absolute difference in events, where any were recorded",
-    "count_mae_silent": "the same where none were",
-    "event_f1": "of pixels with at least one event; predictions are rounded towards zero",
-    "none_psnr": "event_psnr of predicting nothing",
-    "none_count_psnr": "count_psnr of predicting nothing",
-}
+"""Lengths of the windows as shares of the capture: the longest of the paper's, and the shortest."""
+MOST_COUNT = 20.0
+"""Counts are clipped to this where the range of a metric is fixed."""
 
 Scores = dict[str, float]
 
 
+@dataclass(frozen=True)
+class EventFrame:
+    """The change of log intensity in one window: predicted, and recorded."""
+
+    change: Float[Tensor, "h w"]
+    """Predicted; natural log."""
+    counts: Float[Tensor, "2 h w"]
+    """Recorded events, to darker and to brighter."""
+    thresholds: tuple[float, float]
+    """Contrast thresholds, to darker and to brighter."""
+    largest: float
+    """Largest recorded change of all windows of this length."""
+
+    @property
+    def recorded(self) -> Float[Tensor, "h w"]:
+        """Recorded change: events times their thresholds."""
+        off, on = self.thresholds
+        return on * self.counts[1] - off * self.counts[0]
+
+    @property
+    def net_count(self) -> Float[Tensor, "h w"]:
+        """Recorded events, brighter minus darker."""
+        return self.counts[1] - self.counts[0]
+
+    @property
+    def predicted_count(self) -> Float[Tensor, "h w"]:
+        """Predicted change in mean thresholds."""
+        return self.change / (sum(self.thresholds) / 2)
+
+    @property
+    def active(self) -> Bool[Tensor, "h w"]:
+        """Pixels where an event was recorded."""
+        return self.counts.sum(0) > 0
+
+    def image(self, change: Float[Tensor, "h w"]) -> Float[Tensor, "h w 1"]:
+        """A change mapped from -largest...largest to 0...1."""
+        return ((change / self.largest).clamp(-1, 1) / 2 + 0.5)[..., None]
+
+
+def _event_psnr(frame: EventFrame, change: Tensor) -> float:
+    return _psnr(change, frame.recorded, 2 * frame.largest)
+
+
+def _count_psnr(frame: EventFrame, count: Tensor) -> float:
+    count, recorded = (one.clamp(-MOST_COUNT, MOST_COUNT) for one in (count, frame.net_count))
+    return _psnr(count, recorded, 2 * MOST_COUNT)
+
+
+def _count_mae(frame: EventFrame, where: Tensor) -> float:
+    error = (frame.predicted_count - frame.net_count).abs()
+    return float(error[where].mean()) if where.any() else 0.0
+
+
+EVENT_METRICS: dict[Metric, Callable[[EventFrame], float]] = {
+    Metric(
+        "event_psnr",
+        "event PSNR (dB)",
+        "dB; peak is twice the largest recorded change of all windows (as published)",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: _event_psnr(frame, frame.change),
+    Metric(
+        "event_mae",
+        "event MAE",
+        "mean absolute difference, natural log",
+        "lower",
+        "{:.4g}",
+    ): lambda frame: float((frame.change - frame.recorded).abs().mean()),
+    Metric(
+        "event_ssim",
+        "event SSIM",
+        "on event frames mapped from -M...M to 0...1, M the largest recorded change",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: float(ssim(frame.image(frame.change), frame.image(frame.recorded))),
+    Metric(
+        "count_psnr",
+        "PSNR of counts (dB)",
+        f"dB, in events, peak {2 * MOST_COUNT:g}, both clipped to +-{MOST_COUNT:g}",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: _count_psnr(frame, frame.predicted_count),
+    Metric(
+        "count_mae_busy",
+        "MAE of counts, active pixels",
+        "mean absolute difference in events, where any were recorded",
+        "lower",
+        "{:.4g}",
+    ): lambda frame: _count_mae(frame, frame.active),
+    Metric(
+        "count_mae_silent",
+        "MAE of counts, silent pixels",
+        "the same where none were",
+        "lower",
+        "{:.4g}",
+    ): lambda frame: _count_mae(frame, ~frame.active),
+    Metric(
+        "event_f1",
+        "F1 of active pixels",
+        "of pixels with at least one event; predictions are rounded towards zero",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: _f1(frame.predicted_count.trunc() != 0, frame.net_count != 0),
+    Metric(
+        "none_psnr",
+        "event PSNR of no events",
+        "event_psnr of predicting nothing",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: _event_psnr(frame, 0 * frame.change),
+    Metric(
+        "none_count_psnr",
+        "PSNR of counts of no events",
+        "count_psnr of predicting nothing",
+        "higher",
+        "{:.4g}",
+    ): lambda frame: _count_psnr(frame, 0 * frame.net_count),
+}
+"""Metrics of one event frame."""
+
+
 @runtime_checkable
-class SeesEvents(Protocol):
-    """A model that says what its event camera makes of light."""
+class HasLogLight(Protocol):
+    """A model that states how its event camera responds to light."""
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
-        """Natural log of what a pixel's photoreceptor reports, up to a constant."""
+        """Log intensity (natural log, up to a constant) that the photoreceptors report."""
         ...
 
 
@@ -81,30 +191,33 @@ def event_scores(
     pairs: dict[float, list[tuple[Tensor, Tensor]]] = {length: [] for length in lengths}
     for track in np.unique(np.asarray(capture.test_events.track)).tolist():
         for start in (np.arange(windows) + 0.5) / windows * (1 - max(lengths)):
-            first = log_view(model, int(track), float(start))
+            first = log_intensity(model, int(track), float(start))
             for length in lengths:
-                change = log_view(model, int(track), float(start + length)) - first
-                counted = recorded_counts(capture, index, int(track), (start, start + length))
+                change = log_intensity(model, int(track), float(start + length)) - first
+                counted = count_recorded(capture, index, int(track), (start, start + length))
                 pairs[length].append((change, counted))
     return {
-        "definitions": DEFINITIONS,
+        "definitions": {metric.name: metric.definition for metric in EVENT_METRICS},
         "lengths": {f"{length:.5g}": _scores(pairs[length], capture) for length in lengths},
     }
 
 
-def log_view(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
-    """Log intensity that a camera sees at a time."""
+def log_intensity(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
+    """Log intensity that a camera sees at a time, as the response of the model gives it.
+
+    A model without a response of its own gets the logarithm of luma above the floor of `formation`.
+    """
     own = model.capture
     home = device_of(own.trajectory)
     pose = own.trajectory.pose(torch.tensor(time, device=home), torch.tensor(track, device=home))
     pose = pose.detach().to(device_of(model))
     seen = render_view(renderer_of(model), own.camera, pose, time).rgb
-    if isinstance(model, SeesEvents):
+    if isinstance(model, HasLogLight):
         return model.log_light(seen.to(device_of(model))).detach().cpu()
     return (luma(seen) + FLOOR).log()
 
 
-def recorded_counts(
+def count_recorded(
     capture: Capture, index: EventIndex, track: int, window: tuple[float, float]
 ) -> Float[Tensor, "2 h w"]:
     """How many events to darker and to brighter each pixel reported."""
@@ -116,35 +229,21 @@ def recorded_counts(
     return torch.from_numpy(counts).permute(2, 0, 1).float()
 
 
-def usual_threshold(capture: Capture) -> float:
+def mean_threshold(capture: Capture) -> float:
     """Mean of the thresholds to darker and to brighter."""
     return sum(thresholds_of(capture)) / 2
 
 
 def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
-    """Means over event frames."""
+    """Means over event frames, each a predicted change `[h w]` and recorded counts `[2 h w]`."""
     off, on = thresholds_of(capture)
-    usual = usual_threshold(capture)
-    recorded = [on * counts[1] - off * counts[0] for _, counts in pairs]
-    most = max(float(torch.stack(recorded).abs().max()), usual)
-    rows: list[Scores] = []
-    for (change, counts), measured in zip(pairs, recorded, strict=True):
-        net, predicted = counts[1] - counts[0], change / usual
-        busy = counts.sum(0) > 0
-        rows.append(
-            {
-                "event_psnr": _psnr(change, measured, 2 * most),
-                "event_mae": float((change - measured).abs().mean()),
-                "event_ssim": float(ssim(*(_as_image(x, most) for x in (change, measured)))),
-                "count_psnr": _psnr(predicted.clamp(-MOST, MOST), net.clamp(-MOST, MOST), 2 * MOST),
-                "count_mae_busy": _mean_where((predicted - net).abs(), busy),
-                "count_mae_silent": _mean_where((predicted - net).abs(), ~busy),
-                "event_f1": _f1(predicted.trunc() != 0, net != 0),
-                "none_psnr": _psnr(0 * measured, measured, 2 * most),
-                "none_count_psnr": _psnr(0 * net, net.clamp(-MOST, MOST), 2 * MOST),
-            }
-        )
-    return {name: math.fsum(row[name] for row in rows) / len(rows) for name in rows[0]}
+    recorded = torch.stack([on * counts[1] - off * counts[0] for _, counts in pairs])  # [n, h, w]
+    largest = max(float(recorded.abs().max()), mean_threshold(capture))
+    frames = [EventFrame(change, counts, (off, on), largest) for change, counts in pairs]
+    return {
+        metric.name: math.fsum(compute(frame) for frame in frames) / len(frames)
+        for metric, compute in EVENT_METRICS.items()
+    }
 
 
 def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:
@@ -152,16 +251,8 @@ def _psnr(predicted: Tensor, measured: Tensor, peak: float) -> float:
     return 10 * math.log10(peak**2 / max(error, 1e-10 * peak**2))
 
 
-def _as_image(change: Tensor, most: float) -> Float[Tensor, "h w 1"]:
-    return ((change / most).clamp(-1, 1) / 2 + 0.5)[..., None]
-
-
-def _mean_where(value: Tensor, where: Tensor) -> float:
-    return float(value[where].mean()) if where.any() else 0.0
-
-
-def _f1(found: Tensor, wanted: Tensor) -> float:
-    """Harmonic mean of precision and recall; 1 if there is nothing to find and nothing found."""
-    both = int((found & wanted).sum())
-    every = int(found.sum()) + int(wanted.sum())
-    return 2 * both / every if every else 1.0
+def _f1(predicted: Tensor, recorded: Tensor) -> float:
+    """Harmonic mean of precision and recall; 1 where nothing is recorded and nothing predicted."""
+    both = int((predicted & recorded).sum())
+    total = int(predicted.sum()) + int(recorded.sum())
+    return 2 * both / total if total else 1.0

@@ -16,11 +16,15 @@ from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.event_scores import log_view, recorded_counts, usual_threshold
-from sharpfield.report import page
+from sharpfield.evaluation.event_scores import (
+    EVENT_METRICS,
+    count_recorded,
+    log_intensity,
+    mean_threshold,
+)
 from sharpfield.report.colormaps import colour_signs
 from sharpfield.report.event_frames import busy
-from sharpfield.report.tables import Table, as_html
+from sharpfield.report.tables import TextTable
 from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
 
@@ -34,16 +38,6 @@ HIGH_PX = 240
 """Smaller images are enlarged by a whole number of times up to this height."""
 GAP_PX = 4
 """Between the two."""
-
-COLUMNS = {
-    "event_psnr": "event PSNR (dB)",
-    "none_psnr": "of no events",
-    "event_ssim": "event SSIM",
-    "event_mae": "event MAE",
-    "count_psnr": "PSNR of counts (dB)",
-    "none_count_psnr": "of no events",
-    "event_f1": "F1 of busy pixels",
-}
 
 Colours = UInt8[np.ndarray, "height width 3"]
 
@@ -73,28 +67,28 @@ def event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, An
     return found
 
 
-def events_section(run: Path, metrics: Mapping[str, Any]) -> str:
-    """The part of the page about held-out event cameras; nothing if there are none."""
+def events_section(run: Path, metrics: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the page shows of held-out event cameras; None if there are none."""
     events = metrics.get("events")
     if events is None:
-        return ""
+        return None
+    known = [metric for metric in EVENT_METRICS if metric.name in events["definitions"]]
     rows = tuple(
-        (f"1/{1 / float(length):.0f} of the capture", *(f"{scores[n]:.4g}" for n in COLUMNS))
+        (
+            f"1/{1 / float(length):.0f} of the capture",
+            *(metric.text(scores.get(metric.name)) for metric in known),
+        )
         for length, scores in events["lengths"].items()
     )
-    videos = [
-        page.video((run / one["video"]).read_bytes(), f"Camera {one['track']}")
-        for one in events.get("videos", [])
-        if (run / one["video"]).is_file()
-    ]
-    return page.section(
-        "Held-out event cameras",
-        "".join(videos),
-        as_html(Table(("windows", *COLUMNS.values()), rows)),
-        page.folded("What the numbers are", page.definitions(events["definitions"])),
-        intro="Event frames, recorded on the left and predicted on the right: red brighter, blue"
-        " darker, in one scale.",
-    )
+    return {
+        "videos": [
+            (one["track"], (run / one["video"]).read_bytes())
+            for one in events.get("videos", [])
+            if (run / one["video"]).is_file()
+        ],
+        "table": TextTable(("windows", *(metric.title for metric in known)), rows),
+        "definitions": events["definitions"],
+    }
 
 
 def _images(model: Model, capture: Capture, track: int) -> list[Colours]:
@@ -102,13 +96,13 @@ def _images(model: Model, capture: Capture, track: int) -> list[Colours]:
     assert capture.test_events is not None
     index = event_index(capture.test_events)
     ends = np.linspace(0, 1, WINDOWS + 1)
-    views = [log_view(model, track, float(time)) for time in ends]
+    views = [log_intensity(model, track, float(time)) for time in ends]
     predicted = [
-        ((after - before) / usual_threshold(capture)).trunc().numpy()
+        ((after - before) / mean_threshold(capture)).trunc().numpy()
         for before, after in zip(views, views[1:], strict=False)
     ]
     counts = [
-        recorded_counts(capture, index, track, (float(a), float(b))).numpy()
+        count_recorded(capture, index, track, (float(a), float(b))).numpy()
         for a, b in zip(ends, ends[1:], strict=False)
     ]
     recorded = [brighter - darker for darker, brighter in counts]

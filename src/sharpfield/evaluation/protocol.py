@@ -10,10 +10,11 @@ import torch
 
 import sharpfield
 from sharpfield.core.capture import Capture
-from sharpfield.evaluation import alignment_and_depth as more_scores
-from sharpfield.evaluation.scores import DEFINITIONS
+from sharpfield.evaluation.alignment_and_depth import DEPTH_ERROR, PSNR_ALIGNED
+from sharpfield.evaluation.scores import view_metrics
 from sharpfield.evaluation.views import Reference
 from sharpfield.metrics.lpips import SMALLEST_PX, Lpips
+from sharpfield.metrics.registry import Metric
 
 ENABLE_LPIPS = (
     "give torchvision's AlexNet weights (alexnet-owt-7be5be79.pth) and the linear layers of LPIPS"
@@ -47,8 +48,7 @@ def describe(
         "why_no_scores": _why_no_scores(capture, test),
         "domain": "display (as stored), 0...1; renders clamped, not quantised",
         "averaging": "mean over views of the number of each view",
-        **DEFINITIONS,
-        **more_scores.DEFINITIONS,
+        **{one.name: one.definition for one in _defined()},
         "lpips": _lpips(lpips, too_small),
         "pose_refinement": "none",
         "versions": {
@@ -58,6 +58,11 @@ def describe(
             "python": platform.python_version(),
         },
     }
+
+
+def _defined() -> list[Metric]:
+    """Metrics whose definition is stated in one place: those of held-out images."""
+    return [*view_metrics().values(), PSNR_ALIGNED, DEPTH_ERROR]
 
 
 def _why_no_scores(capture: Capture, test: Sequence[Reference]) -> str | None:

@@ -6,8 +6,8 @@ first brought to the model's space by a similarity (`aligned_poses`) and then ea
 gradient descent on the difference between render and image, with the model frozen
 (`refine_poses`).
 
-The better of all poses looked at is chosen by the PSNR on the very image that is then measured,
-which is optimistic by construction; the protocol says so.
+The pose of each view is the one with the best PSNR on the very image that is then measured, which
+is optimistic by construction; the protocol says so.
 
 Source: BAD-NeRF (CVPR 2023) for the idea; numbers as in the authors' successor of Ev-DeblurNeRF
 (IEEE T-RO 2026). That one also leaves out the removal of near floaters while it refines; here the
@@ -34,23 +34,26 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.cast import cast
 from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics.image import psnr
-from sharpfield.metrics.pose import align
+from sharpfield.metrics.pose import absolute_error, align, relative_error
 from sharpfield.rendering.splat import whole
 from sharpfield.rendering.view import CHUNK, ViewRenderer, render_view, renderer_of
 
 Pose = Float[Tensor, "3 4"]
 
-LINE = 1e-3
-"""Camera centres whose spread in the second direction is this part of that in the first lie on a
-line, which leaves a similarity free to turn about it."""
+COLLINEAR = 1e-3
+"""Camera centres whose second singular value is below this part of the first lie on a line, which
+leaves a similarity free to rotate about it."""
 
-FIRST_OPTIMIZER = 0.67
-"""Part of the steps done by RMSprop; Adam does the rest."""
+RMSPROP_SHARE = 0.67
+"""Share of the steps done by RMSprop; Adam does the rest."""
+
+MOVED_SHARE, MOVED_DEG = 1e-4, 0.01
+"""Poses count as refined from this change on: of the spread of the cameras, or in degrees."""
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """How poses are refined. The published numbers are 5000 steps; 1e-5 for synthetic scenes."""
+    """How poses are refined. Published: 5000 steps; rate 1e-5 for synthetic scenes."""
 
     steps: int = 500
     """Steps of gradient descent."""
@@ -59,17 +62,17 @@ class Refinement:
     rate: float = 1e-4
     """Learning rate of the twists, in rad and units of the model's space."""
     every: int = 100
-    """Steps between full renders, which the best pose of each view is chosen by; 0 takes the last
-    pose without looking."""
+    """Steps between full renders, which the best pose of each view is chosen by; 0 takes the pose
+    after the last step."""
     hard_psnr: float = 19.0
-    """Views below this (dB) draw pixels in proportion to their squared error."""
+    """Views with a PSNR below this (dB) sample pixels in proportion to their squared error."""
     rays: int = CHUNK
     """Most rays rendered at once."""
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Poses of the held-out frames in the model's space, and what they brought."""
+    """Refined poses of the held-out frames in the model's space, and the PSNR they gained."""
 
     poses: dict[int, Pose]
     """By frame; on the CPU."""
@@ -78,11 +81,13 @@ class Refined:
     after: dict[int, float]
     """PSNR at the chosen pose."""
     protocol: dict[str, Any]
-    """What to state beside numbers measured at these poses."""
+    """Entries of the protocol for numbers measured at these poses."""
 
 
 @dataclass(frozen=True)
 class _View:
+    """A held-out view and where its refinement starts."""
+
     frame: int
     start: Pose
     time: float
@@ -92,8 +97,8 @@ class _View:
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """What a full render of a view at some pose showed."""
+class _Render:
+    """The error of a full render of a view at some pose."""
 
     twist: Float[Tensor, "6"]
     psnr: float
@@ -102,15 +107,15 @@ class _Seen:
 
 
 def aligned_poses(model: Model, capture: Capture) -> dict[int, Pose]:
-    """Poses of the held-out frames, brought to the model's space by the training frames.
+    """Poses of the held-out frames in the model's space, aligned by the training frames.
 
     Args:
-        model: Its own capture may have refined poses, or be in another space altogether.
-        capture: With the poses as they were measured.
+        model: Its capture may have refined poses, or another space altogether.
+        capture: With the measured poses.
 
     Returns:
-        For each held-out frame a pose; the model's own where fewer than three training cameras,
-        or cameras on one line, do not fix a similarity.
+        A pose for each held-out frame; the model's own where fewer than three training cameras,
+        or cameras on one line, do not determine a similarity.
     """
     train, test = capture.split.train, capture.split.test
     measured = _poses(capture, capture, train)
@@ -122,52 +127,93 @@ def aligned_poses(model: Model, capture: Capture) -> dict[int, Pose]:
     return {int(frame): pose for frame, pose in zip(test, own, strict=True)}
 
 
+def training_pose_errors(model: Model, capture: Capture) -> dict[str, Any] | None:
+    """How far the training poses of a model are from the capture's, after the best similarity.
+
+    Where the capture's poses are the true ones these are trajectory errors; else they tell how far
+    refinement moved the poses.
+
+    Args:
+        model: Trained.
+        capture: With the measured poses.
+
+    Returns:
+        Absolute trajectory error and relative pose error (RMS) of the training frames in order of
+        time; None where the model did not move poses, or a similarity is not determined.
+    """
+    train = capture.split.train
+    if capture.frames is None or len(train) < 3:
+        return None
+    train = train[np.argsort(capture.frames.exposure.middle_us[train], kind="stable")]
+    reference = _poses(capture, capture, train).double()
+    if _on_a_line(reference):
+        return None
+    estimate = _poses(model.capture, capture, train).double()
+    absolute, relative = absolute_error(estimate, reference), relative_error(estimate, reference)
+    centre = reference[..., 3]
+    spread = float((centre - centre.mean(0)).square().sum(-1).mean().sqrt())
+    if absolute.translation < MOVED_SHARE * spread and absolute.rotation_deg < MOVED_DEG:
+        return None
+    return {
+        "definition": "RMS over training frames of the difference from the capture's poses, in its"
+        " units and degrees, after the best similarity; relative: of the motion between frames",
+        "frames": len(train),
+        "absolute": asdict(absolute),
+        "relative": asdict(relative),
+    }
+
+
 def refine_poses(
     model: Model,
     capture: Capture,
     *,
-    how: Refinement | None = None,
+    options: Refinement | None = None,
     start: Mapping[int, Pose] | None = None,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Refined:
-    """Poses from which the model's renders look most like the held-out images.
+    """Poses from which the renders of a model match the held-out images best.
 
     Args:
         model: Trained; it is not changed.
         capture: Holds the images.
-        how: Options.
+        options: Options.
         start: Poses to begin with, by frame; by default the model's own.
-        seed: For the choice of pixels.
+        seed: Random seed of the choice of pixels.
         progress: Called with the steps done, and all.
 
     Raises:
         OptionError: No frame is held out, or the model knows no absolute brightness.
     """
-    how = how or Refinement()
+    options = options or Refinement()
     views = _views(model, capture, start or {})
-    home = device_of(model)
-    twists = nn.Parameter(torch.zeros(len(views), 6, device=home))
-    optimizers = (torch.optim.RMSprop([twists], how.rate), torch.optim.Adam([twists], how.rate))
-    first = best = last = _look(model, views, twists) if how.every else []
+    device = device_of(model)
+    twists = nn.Parameter(torch.zeros(len(views), 6, device=device))
+    optimizers = (
+        torch.optim.RMSprop([twists], options.rate),
+        torch.optim.Adam([twists], options.rate),
+    )
+    first = best = last = _render_all(model, views, twists) if options.every else []
     with _frozen(model):
-        for step in range(how.steps):
+        for step in range(options.steps):
             random = numpy_generator(seed, step, "refine")
-            drawn = [_draw(random, view, how, last[i : i + 1]) for i, view in enumerate(views)]
-            twists.grad = _gradient(model, views, twists, drawn, how.rays)
-            optimizers[step >= FIRST_OPTIMIZER * how.steps].step()
-            if how.every and ((step + 1) % how.every == 0 or step + 1 == how.steps):
-                last = _look(model, views, twists)
+            sampled = [
+                _sample(random, view, options, last[i : i + 1]) for i, view in enumerate(views)
+            ]
+            twists.grad = _gradient(model, views, twists, sampled, options.rays)
+            optimizers[step >= RMSPROP_SHARE * options.steps].step()
+            if options.every and ((step + 1) % options.every == 0 or step + 1 == options.steps):
+                last = _render_all(model, views, twists)
                 best = list(map(_better, best, last))
             if progress is not None:
-                progress(step + 1, how.steps)
-    chosen = torch.stack([seen.twist for seen in best]) if best else twists.detach()
-    moved = se3.compose(torch.stack([view.start for view in views]), se3.exp(chosen)).cpu()
+                progress(step + 1, options.steps)
+    chosen = torch.stack([render.twist for render in best]) if best else twists.detach()
+    refined = se3.compose(torch.stack([view.start for view in views]), se3.exp(chosen)).cpu()
     return Refined(
-        poses={view.frame: pose for view, pose in zip(views, moved, strict=True)},
-        before={view.frame: seen.psnr for view, seen in zip(views, first, strict=False)},
-        after={view.frame: seen.psnr for view, seen in zip(views, best, strict=False)},
-        protocol=_protocol(how),
+        poses={view.frame: pose for view, pose in zip(views, refined, strict=True)},
+        before={view.frame: render.psnr for view, render in zip(views, first, strict=False)},
+        after={view.frame: render.psnr for view, render in zip(views, best, strict=False)},
+        protocol=_protocol(options),
     )
 
 
@@ -175,10 +221,10 @@ def _views(model: Model, capture: Capture, start: Mapping[int, Pose]) -> list[_V
     if model.capture.frames is None:
         raise OptionError(
             "poses cannot be refined with a model of events alone",
-            got="a model that knows brightness up to an unknown gain and offset",
+            got="a model whose brightness has an unknown gain and offset",
             do="evaluate without refinement",
         )
-    home, references = device_of(model), held_out(capture)
+    device, references = device_of(model), held_out(capture)
     if not references:
         raise OptionError("poses cannot be refined: no frame is held out", where=capture.name)
     frames = np.array([reference.frame for reference in references])
@@ -188,31 +234,31 @@ def _views(model: Model, capture: Capture, start: Mapping[int, Pose]) -> list[_V
     shutter = Rolling.of(capture, along=model.capture.trajectory)
     for reference, pose, time in zip(references, own, middle, strict=True):
         assert reference.image is not None, "a held-out frame has its own image"
-        begin = start.get(reference.frame, pose).to(home)
+        pose0 = start.get(reference.frame, pose).to(device)
         track = torch.tensor(int(capture.needed_frames.track[reference.frame]))
         with torch.no_grad():
-            rows = shutter.rows(torch.tensor(float(time)).to(home), track.to(home))
-        rows = moved_rows(rows, pose, begin)
-        image = reference.image.to(home)
-        views.append(_View(reference.frame, begin, float(time), rows, image))
+            rows = shutter.rows(torch.tensor(float(time)).to(device), track.to(device))
+        rows = moved_rows(rows, pose, pose0)
+        image = reference.image.to(device)
+        views.append(_View(reference.frame, pose0, float(time), rows, image))
     return views
 
 
-def _better(one: _Seen, other: _Seen) -> _Seen:
+def _better(one: _Render, other: _Render) -> _Render:
     return other if other.psnr > one.psnr else one
 
 
 @contextmanager
 def _frozen(model: Model) -> Iterator[None]:
-    """Spare the gradients of everything the model has learned."""
+    """Turn off the gradients of all parameters of the model."""
     assert isinstance(model, nn.Module), f"{type(model).__name__} is not an nn.Module"
-    learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     try:
-        for parameter in learned:
+        for parameter in trainable:
             parameter.requires_grad_(False)
         yield
     finally:
-        for parameter in learned:
+        for parameter in trainable:
             parameter.requires_grad_(True)
 
 
@@ -220,22 +266,22 @@ def _gradient(
     model: Model,
     views: Sequence[_View],
     twists: Float[Tensor, "m 6"],
-    drawn: Sequence[Int64[np.ndarray, "p"]],
+    sampled: Sequence[Int64[np.ndarray, "p"]],
     rays: int,
 ) -> Float[Tensor, "m 6"]:
-    """Gradient of the error at the drawn pixels, for each view's twist."""
+    """Gradient of the error at the sampled pixels, for the twist of each view."""
     total = torch.zeros_like(twists)
-    for i, part in _parts(drawn, rays):
-        error = len(part) / len(drawn[i]) * _error(model, views[i], twists[i], part)
+    for i, part in _parts(sampled, rays):
+        error = len(part) / len(sampled[i]) * _error(model, views[i], twists[i], part)
         total += torch.autograd.grad(error, twists)[0]
     return total
 
 
 def _parts(
-    drawn: Sequence[Int64[np.ndarray, "p"]], rays: int
+    sampled: Sequence[Int64[np.ndarray, "p"]], rays: int
 ) -> Iterator[tuple[int, Int64[np.ndarray, "q"]]]:
-    """Each view's pixels, at most so many at once."""
-    for i, pixels in enumerate(drawn):
+    """The pixels of each view, at most `rays` at once."""
+    for i, pixels in enumerate(sampled):
         for first in range(0, len(pixels), rays):
             yield i, pixels[first : first + rays]
 
@@ -249,34 +295,36 @@ def _error(
     pose = se3.compose(view.start, se3.exp(twist))
     if isinstance(model, ViewRenderer):
         rows = moved_rows(view.rows, view.start, pose)
-        seen = model.draw_views(whole(camera, pose, view.time, rows))[0, row, column, 0]
+        rendered = model.draw_views(whole(camera, pose, view.time, rows))[0, row, column, 0]
     else:
         xy = torch.stack([column, row], -1) + 0.5
         ones = torch.ones_like(xy[:, 0])
-        seen = model.render(
+        rendered = model.render(
             cast(camera, pose.expand(len(pixels), 3, 4), xy, view.time * ones, ones)
         )
     stored = view.image[row, column]
-    error = (model.encode(seen.rgb) - stored).square().mean()
-    if seen.coarse is not None:
-        error = error + (model.encode(seen.coarse.rgb) - stored).square().mean()
+    error = (model.encode(rendered.rgb) - stored).square().mean()
+    if rendered.coarse is not None:
+        error = error + (model.encode(rendered.coarse.rgb) - stored).square().mean()
     return error
 
 
-def _draw(
-    random: np.random.Generator, view: _View, how: Refinement, last: Sequence[_Seen]
+def _sample(
+    random: np.random.Generator, view: _View, options: Refinement, last: Sequence[_Render]
 ) -> Int64[np.ndarray, "p"]:
-    """Pixels of a view: uniform, or where the error is if the view is still far off."""
+    """Random pixels of a view: uniform, or by their error if the PSNR is still low."""
     height, width, _ = view.image.shape
-    if last and last[0].psnr < how.hard_psnr:
+    if last and last[0].psnr < options.hard_psnr:
         error = last[0].error.double().cumsum(0).cpu().numpy()
-        return np.searchsorted(error, random.random(how.pixels) * error[-1], side="right")
-    return random.integers(height * width, size=how.pixels)
+        return np.searchsorted(error, random.random(options.pixels) * error[-1], side="right")
+    return random.integers(height * width, size=options.pixels)
 
 
 @torch.no_grad()
-def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) -> list[_Seen]:
-    """Render every view as it is now."""
+def _render_all(
+    model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]
+) -> list[_Render]:
+    """Render every view at its current pose."""
     found = []
     for view, twist in zip(views, twists.detach().clone(), strict=True):
         pose = se3.compose(view.start, se3.exp(twist))
@@ -286,30 +334,32 @@ def _look(model: Model, views: Sequence[_View], twists: Float[Tensor, "m 6"]) ->
         image = model.encode(light).clamp(0, 1)
         stored = view.image.expand_as(image)
         error = (image - stored).square().mean(-1).reshape(-1)
-        found.append(_Seen(twist, float(psnr(image, stored)), error))
+        found.append(_Render(twist, float(psnr(image, stored)), error))
     return found
 
 
-def _poses(model_side: Capture, capture: Capture, frames: Int64[np.ndarray, "m"]) -> Tensor:
-    """Where `model_side` has the camera in the middle of the exposures of `capture`'s frames."""
-    held, trajectory = capture.needed_frames, model_side.trajectory
-    time = torch.from_numpy(model_side.clock.unit(held.exposure.middle_us[frames])).float()
-    home = device_of(trajectory)
-    track = torch.from_numpy(held.track[frames]).to(home)
-    return Rolling.of(capture, along=trajectory).pose(time.to(home), track).detach().cpu()
+def _poses(posed: Capture, capture: Capture, frames: Int64[np.ndarray, "m"]) -> Tensor:
+    """Poses on the trajectory of `posed` in the middle of the exposures of `capture`'s frames."""
+    held, trajectory = capture.needed_frames, posed.trajectory
+    time = torch.from_numpy(posed.clock.unit(held.exposure.middle_us[frames])).float()
+    device = device_of(trajectory)
+    track = torch.from_numpy(held.track[frames]).to(device)
+    return Rolling.of(capture, along=trajectory).pose(time.to(device), track).detach().cpu()
 
 
 def _on_a_line(poses: Float[Tensor, "m 3 4"]) -> bool:
     centre = poses[:, :, 3].double()
     spread = torch.linalg.svdvals(centre - centre.mean(0))
-    return bool(spread[1] <= LINE * spread[0])
+    return bool(spread[1] <= COLLINEAR * spread[0])
 
 
-def _protocol(how: Refinement) -> dict[str, Any]:
+def _protocol(options: Refinement) -> dict[str, Any]:
     chosen = (
-        f"best PSNR of full renders every {how.every} steps, per view, on the measured image"
+        f"best PSNR of full renders every {options.every} steps, per view, on the measured image"
         " (optimistic)"
-        if how.every
+        if options.every
         else "pose after the last step"
     )
-    return {"pose_refinement": {**asdict(how), "optimizer": "RMSprop, then Adam", "chosen": chosen}}
+    return {
+        "pose_refinement": {**asdict(options), "optimizer": "RMSprop, then Adam", "chosen": chosen}
+    }

@@ -1,14 +1,10 @@
-"""What a model renders where a frame was taken, beside what it should look like.
+"""Renders of a model at the poses of frames, beside their reference images.
 
-What renders are compared with: sharp truth where it is known, else the stored image.
+A *held-out* frame is compared with its sharp truth if the capture knows it, else with its own
+image. That image is sharp when it was taken in one instant; when it was exposed for a while it is
+blurred, and the reference says so, since a sharp render then gets a low score.
 
-A *held-out* frame is compared with its truth if the capture knows it, or with its own image. That
-image is sharp when it was taken in one instant; when it was exposed for a while it is blurred, and
-the reference says so, since a sharp render is then punished for being sharp.
-
-Where things are computed.
-
-A score of a model that is still being trained: a few held-out views, rendered now and then.
+`validation` scores a model during training on a few held-out views.
 """
 
 from collections.abc import Callable
@@ -35,12 +31,12 @@ from sharpfield.report.colormaps import as_display
 TRUTH, SHARP, BLURRED = "truth", "sharp image", "blurred image"
 
 UNSCORED = 3
-"""Training views without truth that are rendered all the same, to look at."""
+"""Training views that are rendered for the report where no truth is known."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A frame, and the image a render from its mid-exposure pose should look like."""
+    """A frame, and the image that a render from its mid-exposure pose is compared with."""
 
     frame: int
     name: str
@@ -49,7 +45,7 @@ class Reference:
     image: Float[Tensor, "h w c"] | None
     """Display domain, 0...1."""
     measured: Float[Tensor, "h w c"]
-    """What the camera recorded, display domain, 0...1."""
+    """As recorded, display domain, 0...1."""
 
 
 def held_out(capture: Capture) -> list[Reference]:
@@ -90,8 +86,8 @@ def _reference(frames: Frames, i: int, *, own_image: bool) -> Reference:
 
 
 @dataclass(frozen=True)
-class View:
-    """A render beside what it should look like."""
+class RenderedView:
+    """A render beside its reference."""
 
     reference: Reference
     light: Float[Tensor, "h w c"]
@@ -101,7 +97,7 @@ class View:
     seconds: float
 
 
-def seen_at(
+def render_reference(
     model: Model,
     reference: Reference,
     capture: Capture,
@@ -109,12 +105,12 @@ def seen_at(
     pose: Float[Tensor, "3 4"] | None = None,
     chunk: int = CHUNK,
     progress: Progress | None = None,
-) -> View:
+) -> RenderedView:
     """Render a model from the middle of a frame's exposure.
 
     Args:
-        model: Trained, more or less.
-        reference: Which frame.
+        model: Trained, or in training.
+        reference: The frame.
         capture: What the frame belongs to; on the same clock as the model's own capture.
         pose: To render from instead of the capture's, in the model's space.
         chunk: Rays rendered at once.
@@ -125,40 +121,43 @@ def seen_at(
     """
     frames, own = capture.needed_frames, model.capture
     time = float(own.clock.unit(frames.exposure.middle_us)[reference.frame])
-    home, track = device_of(own.trajectory), int(frames.track[reference.frame])
-    when = torch.tensor(time, device=home), torch.tensor(track, device=home)
+    device, track = device_of(own.trajectory), int(frames.track[reference.frame])
+    at = torch.tensor(time, device=device), torch.tensor(track, device=device)
     shutter = Rolling.of(capture, along=own.trajectory)
     with torch.no_grad():
-        start = shutter.pose(*when)
-        here = (start if pose is None else pose).to(device_of(model))
-        rows = moved_rows(shutter.rows(*when), start, here)
-    begun = perf_counter()
-    seen = render_view(
-        renderer_of(model), own.camera, here, time, rows=rows, chunk=chunk, progress=progress
+        own_pose = shutter.pose(*at)
+        pose = (own_pose if pose is None else pose).to(device_of(model))
+        rows = moved_rows(shutter.rows(*at), own_pose, pose)
+    start = perf_counter()
+    render = render_view(
+        renderer_of(model), own.camera, pose, time, rows=rows, chunk=chunk, progress=progress
     )
-    if not seen.rgb.isfinite().all():
+    if not render.rgb.isfinite().all():
         raise RunError(
             "the model renders colours that are not finite numbers",
             where=f"frame {reference.name}",
-            got=f"{int((~seen.rgb.isfinite()).sum())} of {seen.rgb.numel()} values",
+            got=f"{int((~render.rgb.isfinite()).sum())} of {render.rgb.numel()} values",
             do="train again, or evaluate an earlier checkpoint",
         )
-    return View(reference, seen.rgb, seen.depth, seen.opacity, perf_counter() - begun)
+    seconds = perf_counter() - start
+    return RenderedView(reference, render.rgb, render.depth, render.opacity, seconds)
 
 
-def brightness_of(model: Model, views: list[View], *, blind: bool | None = None) -> Brightness:
-    """As the model develops light; for a model of events alone, aligned to the references.
+def brightness_of(
+    model: Model, views: list[RenderedView], *, blind: bool | None = None
+) -> Brightness:
+    """The tone curve of the model; for a model of events alone, aligned to the references.
 
     Args:
-        model: Trained, more or less.
+        model: Trained, or in training.
         views: To align.
         blind: Whether the model knows no absolute brightness; None: if its capture has no frames.
     """
-    home = device_of(model)
+    device = device_of(model)
 
     @torch.no_grad()
     def encode(light: Tensor) -> Tensor:
-        return model.encode(light.to(home)).cpu()
+        return model.encode(light.to(device)).cpu()
 
     events = model.capture.events
     blind = model.capture.frames is None if blind is None else blind
@@ -175,14 +174,14 @@ VIEWS = 2
 
 
 def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], float] | None:
-    """What tells the mean PSNR of some held-out views of a model, as `evaluate` measures it.
+    """A function that gives the mean PSNR of some held-out views, as `evaluate` measures it.
 
     Args:
-        capture: What the model learns from, with its held-out frames, as read.
-        views: How many; the same ones every time, evenly spread.
+        capture: As read, with its held-out frames.
+        views: Number of views; the same ones every time, evenly spread.
 
     Returns:
-        The score; None where there is no image to compare with.
+        The function; None where there is no image to compare with.
     """
     known = [reference for reference in held_out(capture) if reference.image is not None]
     if not known:
@@ -190,11 +189,11 @@ def validation(capture: Capture, *, views: int = VIEWS) -> Callable[[Model], flo
     chosen = [known[i] for i in evenly_spread(np.arange(len(known)), views)]
 
     def mean_psnr(model: Model) -> float:
-        seen = [seen_at(model, reference, capture) for reference in chosen]
-        brightness = brightness_of(model, seen)
+        rendered = [render_reference(model, reference, capture) for reference in chosen]
+        brightness = brightness_of(model, rendered)
         scores = [
             psnr(brightness.image(view.light), brightness.reference(image))
-            for view in seen
+            for view in rendered
             if (image := view.reference.image) is not None
         ]
         return float(sum(scores)) / len(scores)

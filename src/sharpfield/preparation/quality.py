@@ -6,12 +6,10 @@ Blur a folder of sharp images, each by one random motion kernel, and say what wa
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float64, UInt8
-from matplotlib.figure import Figure
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
@@ -20,6 +18,11 @@ from sharpfield.core.seed import numpy_generator
 from sharpfield.metrics.quality import Means, Quality, Way, event_quality, quality
 from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.storage.images import list_images, read_image, write_image
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+else:  # matplotlib is imported when a figure is drawn
+    Figure = Any
 
 SHOWN = 5
 """Frames at each end of the ranking that the image shows."""
@@ -100,6 +103,9 @@ def rank_correlation(a: Float64[np.ndarray, "m"], b: Float64[np.ndarray, "m"]) -
 
 def ranking(capture: Capture, found: Quality, told_by: str) -> Figure:
     """Scores and weights along the video, and the blurriest and sharpest frames."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
     order = np.argsort(found.scores, kind="stable")
     shown = min(SHOWN, max(len(order) // 2, 1))
     with matplotlib.rc_context({"font.size": 8}):

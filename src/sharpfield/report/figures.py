@@ -1,7 +1,7 @@
-"""Drawings of the report: the camera's path, when it exposed, and how training went.
+"""Plots of the report: camera path, exposures and event rate, losses of training.
 
-Each function returns an SVG to be placed inside a page: no background, lines and text in the
-page's own text colour, so that it fits a light and a dark page.
+Each function returns an SVG element for a page: no background, lines and text in the text colour
+of the page, so that it fits a light and a dark one.
 """
 
 import csv
@@ -9,33 +9,36 @@ import io
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.space import average_pose
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+else:  # matplotlib takes half a second to import, which only a figure is worth
+    Axes = Figure = Any
+
 INK = "#010203"
-"""Stands for the page's text colour until the SVG is written."""
+"""Replaced by the text colour of the page when the SVG is written."""
 TRAIN, TEST, EVENTS = "#c2571a", "#2f7fb8", "#8a8f98"
 LINES = ("#2f7fb8", "#c2571a", "#3c9a6b", "#8b62b5", "#b8901f", "#c24a77", "#5f6b7a", "#4aa3a3")
 
 PATH_POINTS = 400
 BINS = 240
 RATE_SHARE = 0.76
-"""Part of the timeline's height for the rate of events; exposures are above."""
+"""Share of the timeline's height for the event rate; exposures are above."""
 MS = 1000
 
 
 def trajectory_figure(capture: Capture) -> str:
-    """The cameras' paths from above and from the side, with exposures and held-out frames."""
-    drawing, (above, side) = _drawing(7.6, 3.4, columns=2)
+    """Camera paths from above and from the side, with exposures and held-out frames."""
+    figure, (above, side) = _figure(7.6, 3.4, columns=2)
     paths = _paths(capture)
     middle = _frame_poses(capture)
     centre = average_pose(np.concatenate([*paths, middle]))
@@ -66,15 +69,15 @@ def trajectory_figure(capture: Capture) -> str:
         axes.margins(0.12)
     _name(above, "from above", "right", "forward")
     _name(side, "from the side", "forward", "up")
-    return _svg(drawing, "path", "Path of the camera from above and from the side")
+    return _svg(figure, "path", "Camera path from above and from the side")
 
 
 def timeline_figure(capture: Capture) -> str | None:
-    """When the shutters were open, and how many events came; None if times are made up."""
+    """Exposures and event rate over time; None if times are made up."""
     frames, events = capture.frames, capture.events
     if events is None and (frames is None or capture.known.motion == "unknown"):
         return None
-    drawing, (axes,) = _drawing(7.6, 1.7, columns=1)
+    figure, (axes,) = _figure(7.6, 1.7, columns=1)
     origin = capture.clock.origin_us
     if events is not None and len(events):
         edges = np.linspace(events.t_us[0], events.t_us[-1] + 1, BINS + 1)
@@ -89,7 +92,7 @@ def timeline_figure(capture: Capture) -> str | None:
         _shutter(axes, capture)
     axes.set_xlabel("time, ms", color=INK, fontsize=8)
     axes.margins(x=0.01)
-    return _svg(drawing, "timeline", "Exposures and event rate over time")
+    return _svg(figure, "timeline", "Exposures and event rate over time")
 
 
 def curves_figure(log: Path) -> str | None:
@@ -100,7 +103,7 @@ def curves_figure(log: Path) -> str | None:
     if not columns.get("step"):
         return None
     panels = [kind for kind in (losses, scores) if kind]
-    drawing, all_axes = _drawing(7.6, 2.9, columns=len(panels))
+    figure, all_axes = _figure(7.6, 2.9, columns=len(panels))
     for axes, panel in zip(all_axes, panels, strict=True):
         for i, (name, values) in enumerate(panel.items()):
             _line(axes, columns["step"], values, name, INK if name == "total" else LINES[i % 8])
@@ -111,7 +114,7 @@ def curves_figure(log: Path) -> str | None:
             axes.set_title("losses", color=INK, fontsize=10, loc="left")
         else:
             axes.set_title("scores during training (PSNR, dB)", color=INK, fontsize=10, loc="left")
-    return _svg(drawing, "curves", "Losses and scores over the steps of training")
+    return _svg(figure, "curves", "Losses and scores over the steps of training")
 
 
 def read_log(path: Path) -> dict[str, list[float | None]]:
@@ -135,14 +138,14 @@ def _line(
     name: str,
     ink: str,
 ) -> None:
-    """A curve through the steps that have a value."""
+    """Plot a curve through the steps that have a value."""
     pairs = [(s, v) for s, v in zip(steps, values, strict=True) if s is not None and v is not None]
     marker = "o" if len(pairs) < 12 else ""
     axes.plot(*zip(*pairs, strict=True), color=ink, lw=1.3, marker=marker, ms=3, label=name)
 
 
 def _shutter(axes: Axes, capture: Capture) -> None:
-    """Bars in the upper part while a shutter is open, one line of bars for each track."""
+    """Bars in the upper part of the plot for exposures, one row for each track."""
     frames, held = capture.needed_frames, set(capture.split.test.tolist())
     start = (frames.exposure.open_us - capture.clock.origin_us) / MS
     end = (frames.exposure.close_us - capture.clock.origin_us) / MS
@@ -160,7 +163,7 @@ def _shutter(axes: Axes, capture: Capture) -> None:
 
 
 def _paths(capture: Capture) -> list[Float[np.ndarray, "n 3 4"]]:
-    """Poses along each moving track over its known time."""
+    """Poses along each moving track over its known time span."""
     tracks = np.unique(capture.frames.track) if capture.frames is not None else np.zeros(1, int)
     found = []
     for track in tracks:
@@ -171,7 +174,7 @@ def _paths(capture: Capture) -> list[Float[np.ndarray, "n 3 4"]]:
 
 
 def _exposures(capture: Capture) -> list[Float[np.ndarray, "n 3 4"]]:
-    """Poses during each exposure that lasts."""
+    """Poses during each exposure, but for frames taken in one instant."""
     frames = capture.frames
     if frames is None:
         return []
@@ -199,10 +202,13 @@ def _along(
     return capture.trajectory.pose(unit, tracks).detach().double().numpy()
 
 
-def _drawing(width: float, height: float, *, columns: int) -> tuple[Figure, list[Axes]]:
-    drawing = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasSVG(drawing)
-    all_axes = [drawing.add_subplot(1, columns, i + 1) for i in range(columns)]
+def _figure(width: float, height: float, *, columns: int) -> tuple[Figure, list[Axes]]:
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasSVG(figure)
+    all_axes = [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
     for axes in all_axes:
         axes.patch.set_visible(False)
         axes.tick_params(colors=INK, labelsize=8)
@@ -211,7 +217,7 @@ def _drawing(width: float, height: float, *, columns: int) -> tuple[Figure, list
             spine.set_visible(name in ("left", "bottom"))
             spine.set_color(INK)
             spine.set_alpha(0.3)
-    return drawing, all_axes
+    return figure, all_axes
 
 
 def _name(axes: Axes, title: str, across: str, up: str) -> None:
@@ -220,12 +226,14 @@ def _name(axes: Axes, title: str, across: str, up: str) -> None:
     axes.set_ylabel(f"{up} →", color=INK, fontsize=8)
 
 
-def _svg(drawing: Figure, name: str, title: str) -> str:
-    """The drawing as an SVG element, with names of its own so that several share a page."""
+def _svg(figure: Figure, name: str, title: str) -> str:
+    """The figure as an SVG element, with unique ids so that several fit on one page."""
+    import matplotlib
+
     buffer = io.StringIO()
     # Text stays text, in the page's font; the salt makes the same data give the same page.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
-        drawing.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :].replace(INK, "currentColor")
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)

@@ -1,24 +1,26 @@
-"""Videos: images written one after another, as they are made, to a file or a folder.
+"""Videos: images written one after another to a file or a folder.
 
 `FILE.mp4` holds H.264 in the pixel format that every browser plays; any other path is a folder
-that gets one PNG per image. Either appears whole, at the end, or not at all.
+that gets one PNG per image. Either appears complete, at the end, or not at all.
 """
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import av
 import numpy as np
-from av.video.codeccontext import VideoCodecContext
-from av.video.reformatter import Colorspace
 from jaxtyping import UInt8
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.files import replacing, replacing_folder
 from sharpfield.storage.images import list_images, write_image
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+else:  # PyAV is imported when a video is written
+    VideoCodecContext = Any
 
 QUALITY = 18
 """Constant rate factor of x264: visually lossless."""
@@ -27,7 +29,7 @@ Image = UInt8[np.ndarray, "h w c"]
 
 
 class Writer(Protocol):
-    """Takes the images of a video in order."""
+    """Appends the images of a video in order."""
 
     def __call__(self, image: Image) -> None:
         """Append one image, RGB or grey."""
@@ -35,19 +37,19 @@ class Writer(Protocol):
 
 
 @contextmanager
-def video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
-    """A writer of images, all of one size.
+def open_video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
+    """Open a video; gives a function that appends images, all of one size.
 
     Args:
         path: Ends in `.mp4` for a video; anything without a suffix is a folder of PNGs.
-        rate: Images per second.
+        rate: Frames per second of the video.
 
     Raises:
         OptionError: Another suffix, a rate that is not positive, or a folder with other files.
     """
     if path.suffix.lower() == ".mp4":
         if not rate > 0:
-            raise OptionError("a video needs a positive rate", got=rate)
+            raise OptionError("a video needs a positive frame rate", got=rate)
         with _mp4(path, rate) as write:
             yield write
     elif path.suffix and not path.is_dir():
@@ -60,9 +62,9 @@ def video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
 
 
 def write_video(path: Path, images: Iterable[Image], *, rate: float = 30.0) -> int:
-    """Write images as they come; returns how many. See `video`."""
+    """Write images as they are made; returns their number. See `open_video`."""
     count = 0
-    with video(path, rate=rate) as write:
+    with open_video(path, rate=rate) as write:
         for image in images:
             write(image)
             count += 1
@@ -85,6 +87,9 @@ def _folder(path: Path) -> Iterator[Writer]:
 
 @contextmanager
 def _mp4(path: Path, rate: float) -> Iterator[Writer]:
+    import av
+    from av.video.reformatter import Colorspace
+
     with replacing(path) as temporary:
         with av.open(temporary, "w", options={"movflags": "faststart"}) as file:
             stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
@@ -125,5 +130,5 @@ def _expect_replaceable(path: Path) -> None:
     raise OptionError(
         "will not replace a folder that holds other things than images",
         where=path,
-        do="choose another place, or empty it",
+        do="choose another folder, or empty it",
     )

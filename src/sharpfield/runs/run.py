@@ -12,9 +12,9 @@ from rich.console import Console
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import RunError
 from sharpfield.core.progress import progress_on
-from sharpfield.evaluation.evaluate import Measuring, evaluate
+from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.refine import Refinement, refine_poses
-from sharpfield.evaluation.report import Story, write_report
+from sharpfield.evaluation.report import RunDescription, write_report
 from sharpfield.metrics.lpips import Lpips
 from sharpfield.runs.config import RunConfig, device_named, read_run_config, used
 from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
@@ -116,7 +116,7 @@ class Run:
             refine: Refine the held-out poses first, with the scene frozen, and how.
             train_views: Most training views to render as well; None for all with known truth.
             lpips: With its weights, to compute LPIPS.
-            baselines: Metrics of other methods, for the report; see `evaluation.evaluate`.
+            baselines: Metrics of other methods, for the report; see `evaluation.measure`.
             title: Of the report.
             console: Where progress is shown.
 
@@ -126,7 +126,7 @@ class Run:
         volume = getattr(self.config.recipe, "volume", None)
         poses, stated = {}, {"near_plane_removal": getattr(volume, "clear_before", 0.0)}
         if refine is not None:
-            found = refine_poses(self.model, self.capture, how=refine)
+            found = refine_poses(self.model, self.capture, options=refine)
             poses, stated = found.poses, {**stated, **found.protocol}
         with progress_on(console or Console()) as progress:
             task = progress.add_task("rendering", total=None)
@@ -134,18 +134,18 @@ class Run:
                 self.model,
                 self.capture,
                 self.folder,
-                measuring=Measuring(
+                options=EvaluationOptions(
                     train_views=train_views, lpips=lpips, poses=poses, stated=stated
                 ),
                 baselines=baselines,
                 progress=lambda done, total: progress.update(task, completed=done, total=total),
             )
-        story = Story(
+        about = RunDescription(
             title=title or f"{self.config.name} on {self.capture.name}",
             paper=self.config.recipe.paper,
             settings=self.config.settings(),
         )
-        write_report(self.folder, self.capture, metrics, story)
+        write_report(self.folder, self.capture, metrics, about)
         return metrics
 
 

@@ -35,7 +35,7 @@ def mapped(relief_of_depth: float, *, sideways: float = 0.25, few: int = 0) -> M
         camera=camera,
         points=points,
         point_error_px=np.full(POINTS, 0.6),
-        sightings=np.argwhere(sharing).astype(np.int64),
+        observations=np.argwhere(sharing).astype(np.int64),
         error_px=np.full(VIEWS, 0.6),
     )
 
@@ -87,7 +87,7 @@ def test_the_world_it_is_in_does_not_matter() -> None:
     poses = np.concatenate([turn @ made.poses[:, :, :3], 7 * (turn @ made.poses[:, :, 3:]) + 2], -1)
     moved = Map(
         made.registered, poses, made.camera, 7 * made.points @ turn.T + 2, made.point_error_px,
-        made.sightings, made.error_px,
+        made.observations, made.error_px,
     )  # fmt: skip
     here, there = relief(made), relief(moved)
     assert here is not None and there is not None
@@ -96,7 +96,7 @@ def test_the_world_it_is_in_does_not_matter() -> None:
 
 def test_images_that_share_too_little_say_nothing() -> None:
     made = mapped(0.0)
-    alone = made.sightings[made.sightings[:, 0] == made.sightings[:, 1] % VIEWS]
+    alone = made.observations[made.observations[:, 0] == made.observations[:, 1] % VIEWS]
     lonely = Map(
         made.registered, made.poses, made.camera, made.points, made.point_error_px, alone,
         made.error_px,

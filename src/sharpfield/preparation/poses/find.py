@@ -47,7 +47,7 @@ ERROR_PX, VIEWS = 1.5, 3
 
 BOUNDS_PERCENT = (0.5, 99.5)
 BOUNDS_MARGIN = 1.1
-"""Near and far are these percentiles of the depth of all sightings, and a margin."""
+"""Near and far are these percentiles of the depth of all observations, and a margin."""
 
 
 KnownAt = Callable[[Int64[np.ndarray, "n"]], Known]
@@ -186,7 +186,7 @@ def _with_poses(
     )  # fmt: skip
     good = (found.point_error_px < ERROR_PX) & (found.track_length >= VIEWS)
     good = good if good.any() else np.ones_like(good)
-    near, far = np.percentile(depths(found)[good[found.sightings[:, 1]]], BOUNDS_PERCENT)
+    near, far = np.percentile(depths(found)[good[found.observations[:, 1]]], BOUNDS_PERCENT)
     unsure = np.setdiff1d(np.arange(len(capture.needed_frames)), sharp.frame[there])
     streams = {
         name: None if (held := getattr(capture, name)) is None else within(held, laid.path, laid)

@@ -78,7 +78,7 @@ def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | No
 
 def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
     """Pairs of images that share points and are far from each other, and those points."""
-    view, point = found.sightings.T
+    view, point = found.observations.T
     good = found.track_length[point] >= VIEWS
     shape = len(found.poses), len(found.points)
     seen = np.zeros(shape, np.float32)
@@ -121,6 +121,6 @@ def _thickness(found: Map) -> float:
         normal = np.linalg.svd(good[kept] - centre, full_matrices=False)[2][2]
         distance = np.abs((good - centre) @ normal)
         kept = distance <= np.median(distance)
-    view, point = found.sightings.T
+    view, point = found.observations.T
     toward = found.points[point] - found.poses[view, :, 3]
     return float(np.median(distance) / np.median((toward * found.poses[view, :, 2]).sum(-1)))

@@ -101,7 +101,7 @@ class Map:
     camera: Camera
     points: Float64[np.ndarray, "m 3"]
     point_error_px: Float64[np.ndarray, "m"]
-    sightings: Int64[np.ndarray, "o 2"]
+    observations: Int64[np.ndarray, "o 2"]
     """Which image shows which point."""
     error_px: Float64[np.ndarray, "n"]
     """Mean reprojection error of each image; NaN where not registered."""
@@ -109,7 +109,7 @@ class Map:
     @property
     def track_length(self) -> Int64[np.ndarray, "m"]:
         """How many images show each point."""
-        return np.bincount(self.sightings[:, 1], minlength=len(self.points))
+        return np.bincount(self.observations[:, 1], minlength=len(self.points))
 
 
 def map_images(
@@ -277,7 +277,7 @@ def _parameters(task: LensTask) -> tuple[str, list[float]]:
 def _map(made: Any, count: int, task: LensTask) -> Map:
     """Our arrays of COLMAP's reconstruction."""
     registered, error = np.zeros(count, bool), np.full(count, np.nan)
-    poses, sightings = np.zeros((count, 3, 4)), []
+    poses, observations = np.zeros((count, 3, 4)), []
     row_of = {number: row for row, number in enumerate(sorted(made.points3D))}
     held = next(iter(made.cameras.values()))
     for image in made.images.values():
@@ -288,7 +288,7 @@ def _map(made: Any, count: int, task: LensTask) -> Map:
         camera_from_world = image.cam_from_world()
         poses[i] = camera_from_world.inverse().matrix()
         points = [point for point in image.points2D if point.has_point3D()]
-        sightings += [(i, row_of[point.point3D_id]) for point in points]
+        observations += [(i, row_of[point.point3D_id]) for point in points]
         away = [
             np.linalg.norm(np.asarray(place) - point.xy)
             for point in points
@@ -307,6 +307,6 @@ def _map(made: Any, count: int, task: LensTask) -> Map:
         camera=camera,
         points=np.array([point.xyz for point in inside]).reshape(-1, 3),
         point_error_px=np.array([point.error for point in inside]).reshape(-1),
-        sightings=np.array(sightings, np.int64).reshape(-1, 2),
+        observations=np.array(observations, np.int64).reshape(-1, 2),
         error_px=error,
     )

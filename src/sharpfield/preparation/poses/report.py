@@ -1,9 +1,5 @@
-"""What finding poses leaves behind in numbers and words: which images, how well, and why not.
+"""Reports of pose finding: `poses.json`, text for the terminal, and the page `poses.html`."""
 
-The page that `sharpfield poses` leaves beside the capture: images, points, path, numbers.
-"""
-
-import html
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +9,12 @@ import torch
 from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.files import replacing
 from sharpfield.core.seed import evenly_spread
 from sharpfield.preparation.poses.find import PosesFound
 from sharpfield.preparation.poses.find_checks import advice
-from sharpfield.report import page
 from sharpfield.report.figures import trajectory_figure
-from sharpfield.report.page import Image, Look, View, section
-from sharpfield.report.tables import Table, as_html
+from sharpfield.report.page import CaptionedImage, ComparedView, ImageEncoding, write_page
+from sharpfield.report.tables import TextTable
 
 
 def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
@@ -110,7 +104,7 @@ def _relief(found: PosesFound) -> dict[str, Any] | None:
 
 def _each(original: Capture, found: PosesFound) -> list[dict[str, Any]]:
     sharp, mapped, seen = found.sharp, found.map, found.seen
-    points = np.bincount(mapped.sightings[:, 0], minlength=len(sharp))
+    points = np.bincount(mapped.observations[:, 0], minlength=len(sharp))
     failures = {failure.image: failure for failure in found.failures}
     rows = []
     for i in range(len(sharp)):
@@ -134,155 +128,80 @@ def _rounded(value: float, digits: int) -> float:
     return round(float(value), digits)
 
 
-LOOK = Look(640, 82)
+ENCODING = ImageEncoding(640, 82)
 SHOWN = 6
-"""Images shown, beside all that failed up to as many."""
+"""Registered images shown, and failed ones."""
 GREEN, AMBER = (40, 200, 90), (245, 160, 40)
-ZOOM = 2
-"""Small images are enlarged, so that marks on them can be told apart."""
-SMALL = 480
+ENLARGE, SMALL_PX = 2, 480
+"""Images smaller than this are enlarged, so that marks in them can be told apart."""
+
+IMAGE_SOURCES = {
+    "edi": "frames deblurred with their events",
+    "frames": "frames as recorded",
+    "sharpest": "the sharpest of each three frames",
+}
 
 
-def write_page(path: Path, original: Capture, found: PosesFound, about: dict[str, Any]) -> None:
+def write_poses_page(
+    path: Path, original: Capture, found: PosesFound, about: dict[str, Any]
+) -> None:
     """Write the page.
 
     Args:
-        path: Where.
+        path: The file.
         original: The capture before.
-        found: What was found.
-        about: Its summary.
+        found: Poses, points and failures.
+        about: The summary of `found`.
     """
-    body = "\n".join(
-        part
-        for part in (
-            _header(about),
-            _flat(about),
-            _failures(about),
-            _images(original, found),
-            section(
-                "The path",
-                page.drawing(
-                    trajectory_figure(found.capture),
-                    "Where the camera was: thick where the shutter was open, ticks where it"
-                    " looked; orange to learn from, blue held out.",
-                ),
-            ),
-            _table(about),
-        )
-        if part
+    relief = about["relief"]
+    flat = None
+    if relief is not None and relief["flat"]:
+        flat = TextTable(("what is unsure", "what to try"), ((relief["why"], relief["do"]),))
+    failed = np.flatnonzero(~found.map.registered)[:SHOWN]
+    registered = evenly_spread(np.flatnonzero(found.map.registered), SHOWN)
+    values = {
+        "title": f"{about['capture']}: poses",
+        "heading": about["capture"],
+        "subtitle": f"From {IMAGE_SOURCES[about['images_from']]}",
+        "cards": _cards(about),
+        "flat": flat,
+        "failures": _failures(about),
+        "views": [_view(original, found, int(i)) for i in [*failed, *registered]],
+        "trajectory": trajectory_figure(found.capture),
+        "images": _images(about),
+        "encoding": ENCODING,
+    }
+    write_page(path, "poses.html.j2", values)
+
+
+def _cards(about: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Value, name and remark of the most important numbers."""
+    points, camera, bounds = about["points"], about["camera"], about["bounds"]
+    length_unit = (
+        "median depth of the points is 1"
+        if about["off_known_positions"] is None
+        else "in units of the known positions"
     )
-    with replacing(path) as temporary:
-        temporary.write_text(page.page(f"{about['capture']}: poses", body), encoding="utf-8")
-
-
-def _header(about: dict[str, Any]) -> str:
-    points, camera = about["points"], about["camera"]
-    values = [
+    return [
         (f"{about['registered']} of {about['images']}", "images with a pose", "registered"),
         (f"{about['error_px']:.2f} px", "reprojection error", "mean over images"),
-        (
-            f"{points['map']:,}",
-            "points",
-            f"each seen in {points['mean_track_length']:.1f} images",
-        ),
+        (f"{points['map']:,}", "points", f"each seen in {points['mean_track_length']:.1f} images"),
         (f"{camera['focal_px'][0]:.1f} px", "focal length", str(camera["from"])),
-        (
-            f"{about['bounds']['near']:.3g} … {about['bounds']['far']:.3g}",
-            "near and far",
-            "median depth of the points is 1"
-            if about["off_known_positions"] is None
-            else "in units of the known positions",
-        ),
+        (f"{bounds['near']:.3g} … {bounds['far']:.3g}", "near and far", length_unit),
     ]
-    told = {
-        "edi": "frames deblurred with their events",
-        "frames": "frames as they are",
-        "sharpest": "the sharpest of each three frames",
-    }[about["images_from"]]
-    return (
-        f'<header>\n<p class="eyebrow">sharpfield poses</p>\n<h1>{html.escape(about["capture"])}'
-        f'</h1>\n<p class="subtitle">From {told}</p>\n{page.cards(values)}</header>'
-    )
 
 
-def _flat(about: dict[str, Any]) -> str:
-    relief = about["relief"]
-    if relief is None or not relief["flat"]:
-        return ""
-    rows = ((relief["why"], relief["do"]),)
-    return section("Too flat", as_html(Table(("what is unsure", "what to try"), rows)))
-
-
-def _failures(about: dict[str, Any]) -> str:
+def _failures(about: dict[str, Any]) -> TextTable | None:
     rows = tuple(
         (one["frame"], str(one["features"]), str(one["matches"]), one["why"], one["do"])
         for one in about["each"]
         if not one["registered"]
     )
-    if not rows:
-        return ""
-    table = Table(("image", "features", "matches", "why it has no pose", "what to try"), rows)
-    return section("Without a pose", as_html(table))
+    columns = ("image", "features", "matches", "why it has no pose", "what to try")
+    return TextTable(columns, rows) if rows else None
 
 
-def _images(original: Capture, found: PosesFound) -> str:
-    lost = np.flatnonzero(~found.map.registered)[:SHOWN]
-    good = np.flatnonzero(found.map.registered)
-    spread = evenly_spread(good, SHOWN)
-    views = [_view(original, found, int(i)) for i in [*lost, *spread]]
-    return section(
-        "What was seen",
-        page.comparison(views, LOOK, left="recorded", right="used"),
-        intro="Recorded frames, and the images poses were found from with the points seen in"
-        " them: green within a pixel of where they project, amber farther.",
-    )
-
-
-def _view(original: Capture, found: PosesFound, image: int) -> View:
-    frame = int(found.sharp.frame[image])
-    name = original.needed_frames.names[frame]
-    held = original.needed_frames
-    recorded = np.rint(np.asarray(held.images[frame], np.float64) * (255 / held.white))
-    said = (
-        f"{name}, used: {found.map.error_px[image]:.2f} px"
-        if found.map.registered[image]
-        else f"{name}: no pose"
-    )
-    return View(
-        f"{name} ({image})",
-        (
-            Image("recorded", _large(recorded.astype(np.uint8)), name, f"{name} as recorded"),
-            Image("used", _marked(found, image), said, f"{name} with the points seen in it"),
-        ),
-    )
-
-
-def _marked(found: PosesFound, image: int) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with the points of the map projected into it."""
-    shown = np.ascontiguousarray(_large(found.sharp.images[image]))
-    if not found.map.registered[image]:
-        return shown
-    rows = found.map.sightings[found.map.sightings[:, 0] == image, 1]
-    pose = found.map.poses[image]
-    local = (found.map.points[rows] - pose[:, 3]) @ pose[:, :3]
-    xy = found.map.camera.project(torch.from_numpy(local)).numpy() * (
-        shown.shape[1] / found.map.camera.width
-    )
-    for (x, y), error in zip(xy, found.map.point_error_px[rows], strict=True):
-        colour = GREEN if error < 1 else AMBER
-        cv2.circle(shown, (round(x), round(y)), 3, colour, 1, cv2.LINE_AA)
-    return shown
-
-
-def _large(image: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
-    """In three channels, and large enough to look at."""
-    colour = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image
-    if max(colour.shape) >= SMALL:
-        return colour
-    return cv2.resize(colour, None, fx=ZOOM, fy=ZOOM, interpolation=cv2.INTER_CUBIC)
-
-
-def _table(about: dict[str, Any]) -> str:
+def _images(about: dict[str, Any]) -> TextTable:
     rows = tuple(
         (
             one["frame"],
@@ -294,5 +213,49 @@ def _table(about: dict[str, Any]) -> str:
         )
         for one in about["each"]
     )
-    table = Table(("frame", "time, ms", "features", "partners", "points", "error, px"), rows)
-    return section("Each image", page.folded_if_long("All images", as_html(table), len(rows)))
+    return TextTable(("frame", "time, ms", "features", "partners", "points", "error, px"), rows)
+
+
+def _view(original: Capture, found: PosesFound, image: int) -> ComparedView:
+    frames, frame = original.needed_frames, int(found.sharp.frame[image])
+    name = frames.names[frame]
+    recorded = np.rint(np.asarray(frames.images[frame], np.float64) * (255 / frames.white))
+    caption = (
+        f"{name}, used: {found.map.error_px[image]:.2f} px"
+        if found.map.registered[image]
+        else f"{name}: no pose"
+    )
+    return ComparedView(
+        f"{name} ({image})",
+        (
+            CaptionedImage(
+                "recorded", _enlarged(recorded.astype(np.uint8)), name, f"{name} as recorded"
+            ),
+            CaptionedImage("used", _marked(found, image), caption, f"{name} with its points"),
+        ),
+    )
+
+
+def _marked(found: PosesFound, image: int) -> UInt8[np.ndarray, "h w 3"]:
+    """The image with the points of the map projected into it."""
+    shown = np.ascontiguousarray(_enlarged(found.sharp.images[image]))
+    if not found.map.registered[image]:
+        return shown
+    rows = found.map.observations[found.map.observations[:, 0] == image, 1]
+    pose = found.map.poses[image]
+    local = (found.map.points[rows] - pose[:, 3]) @ pose[:, :3]  # [m, 3], camera axes
+    xy = found.map.camera.project(torch.from_numpy(local)).numpy() * (
+        shown.shape[1] / found.map.camera.width
+    )
+    for (x, y), error in zip(xy, found.map.point_error_px[rows], strict=True):
+        colour = GREEN if error < 1 else AMBER
+        cv2.circle(shown, (round(x), round(y)), 3, colour, 1, cv2.LINE_AA)
+    return shown
+
+
+def _enlarged(image: UInt8[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w 3"]:
+    """In three channels, and large enough to see marks in it."""
+    colour = np.repeat(image, 3, -1) if image.shape[-1] == 1 else image
+    if max(colour.shape) >= SMALL_PX:
+        return colour
+    return cv2.resize(colour, None, fx=ENLARGE, fy=ENLARGE, interpolation=cv2.INTER_CUBIC)

@@ -46,7 +46,7 @@ def measured_world(found: Map, capture: Capture, frame: Int64[np.ndarray, "n"]) 
     for view in np.flatnonzero(found.registered):
         pose, seen = (
             found.poses[view],
-            found.points[found.sightings[found.sightings[:, 0] == view, 1]],
+            found.points[found.observations[found.observations[:, 0] == view, 1]],
         )
         local = (seen - pose[:, 3]) @ pose[:, :3]
         local = local[local[:, 2] > 0]
@@ -86,6 +86,6 @@ def known_world(found: Map, known: Known) -> tuple[Similarity, float]:
 
 def depths(found: Map) -> Float64[np.ndarray, "o"]:
     """Depth of each sighting along its camera's axis."""
-    view, point = found.sightings.T
+    view, point = found.observations.T
     toward = found.points[point] - found.poses[view, :, 3]
     return (toward * found.poses[view, :, 2]).sum(-1)

@@ -22,28 +22,42 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.alignment_and_depth import aligned_psnr, depth_error, distances
+from sharpfield.evaluation.alignment_and_depth import (
+    DEPTH_ERROR,
+    PSNR_ALIGNED,
+    aligned_psnr,
+    distances,
+    scaled_depth_error,
+)
 from sharpfield.evaluation.brightness import Brightness
 from sharpfield.evaluation.event_scores import event_scores
 from sharpfield.evaluation.event_videos import event_videos
 from sharpfield.evaluation.protocol import describe
-from sharpfield.evaluation.scores import HIGHEST_PSNR, NAMES, mean, score
-from sharpfield.evaluation.views import View, brightness_of, held_out, seen_at, trained_on
+from sharpfield.evaluation.refine import training_pose_errors
+from sharpfield.evaluation.scores import mean, score, view_metrics
+from sharpfield.evaluation.views import (
+    RenderedView,
+    brightness_of,
+    held_out,
+    render_reference,
+    trained_on,
+)
 from sharpfield.metrics.image import laplacian_variance
 from sharpfield.metrics.lpips import SMALLEST_PX, Lpips
+from sharpfield.metrics.registry import Metric
 from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, renderer_of
 from sharpfield.report.colormaps import colour_depth, eight_bit
 from sharpfield.storage.images import write_image
 
 METRICS = "metrics.json"
 
-TRACE = 1e-3
-"""Least opacity that depth is divided by."""
+LEAST_OPACITY = 1e-3
+"""Depth is divided by at least this opacity."""
 
 
 @dataclass(frozen=True)
-class Measuring:
-    """How to measure."""
+class EvaluationOptions:
+    """What is rendered and compared, and how."""
 
     chunk: int = CHUNK
     """Rays rendered at once."""
@@ -56,7 +70,7 @@ class Measuring:
     events_only: bool | None = None
     """Whether the model knows no absolute brightness; None: if its capture has no frames."""
     stated: Mapping[str, Any] = field(default_factory=dict)
-    """What the caller knows about the protocol: pose refinement, near-plane removal, ..."""
+    """Further entries of the protocol: pose refinement, near-plane removal, ..."""
 
 
 def evaluate(
@@ -64,7 +78,7 @@ def evaluate(
     capture: Capture,
     run: Path,
     *,
-    measuring: Measuring | None = None,
+    options: EvaluationOptions | None = None,
     baselines: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -74,7 +88,7 @@ def evaluate(
         model: Trained.
         capture: What to compare with; on the same clock as the model's own capture.
         run: Folder that gets `metrics.json` and `renders/`, and has `training.json`.
-        measuring: How.
+        options: Options.
         baselines: Metrics of other methods to keep beside ours, by name: `{"mean": {...}}`, and
             "run" with the folder of their renders, relative to `run`, for the report.
         progress: Called with the number of pixels rendered, and the number of all.
@@ -86,43 +100,48 @@ def evaluate(
         OptionError: The capture's frames have another size than the model's.
         RunError: `training.json` is damaged, or the model renders numbers that are not finite.
     """
-    how = measuring or Measuring()
-    _same_size(model, capture)
-    test, train = held_out(capture), trained_on(capture, limit=how.train_views)
-    shown = _Shown(progress, len(test) + len(train), model.capture.camera.size)
+    options = options or EvaluationOptions()
+    _expect_same_size(model, capture)
+    test, train = held_out(capture), trained_on(capture, limit=options.train_views)
+    total = _TotalProgress(progress, len(test) + len(train), model.capture.camera.size)
     test_views, train_views = (
         [
-            seen_at(
+            render_reference(
                 model,
                 reference,
                 capture,
-                pose=how.poses.get(reference.frame),
-                chunk=how.chunk,
-                progress=shown.within,
+                pose=options.poses.get(reference.frame),
+                chunk=options.chunk,
+                progress=total.within_view,
             )
             for reference in references
         ]
         for references in (test, train)
     )
-    brightness = brightness_of(model, test_views or train_views, blind=how.events_only)
-    lpips = how.lpips if _large_enough(how.lpips, capture) else None
-    tested = [_judge(view, brightness, lpips, run / "renders" / "test") for view in test_views]
-    learned = [_judge(view, brightness, lpips, run / "renders" / "train") for view in train_views]
+    brightness = brightness_of(model, test_views or train_views, blind=options.events_only)
+    lpips = options.lpips if _large_enough(options.lpips, capture) else None
+    too_small = options.lpips is not None and lpips is None
+    known, renders = view_metrics(lpips), run / "renders"
+    tested = [_row(view, brightness, known, renders / "test") for view in test_views]
+    learned = [_row(view, brightness, known, renders / "train") for view in train_views]
+    events = event_scores(model, capture)
     metrics: dict[str, Any] = {
         "protocol": {
-            **describe(capture, test, lpips, too_small=how.lpips is not None and lpips is None),
+            **describe(capture, test, lpips, too_small=too_small),
             "alignment": brightness.words(),
             "compared_as": "luma" if brightness.grey else "all channels",
-            **how.stated,
+            **options.stated,
         },
-        "mean": mean(view for view in tested if view["reference"]),
+        "mean": mean((row for row in tested if row["reference"]), known)
+        | _capture_metrics(model, capture, test_views, brightness, events),
         "views": tested,
-        "train_views": _summary(learned, train_views, brightness, lpips),
+        "train_views": _train_summary(learned, train_views, brightness, known),
         "train": _training(run),
     }
-    if (events := event_scores(model, capture)) is not None:
+    if events is not None:
         metrics["events"] = {**events, "videos": event_videos(model, capture, run)}
-    metrics["mean"] |= _more(model, capture, test_views, brightness, events)
+    if (errors := training_pose_errors(model, capture)) is not None:
+        metrics["poses"] = errors
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
     with replacing(run / METRICS) as temporary:
@@ -130,22 +149,24 @@ def evaluate(
     return metrics
 
 
-class _Shown:
+class _TotalProgress:
     """Progress over several views."""
 
     def __init__(self, progress: Progress | None, views: int, size: tuple[int, int]) -> None:
         self.progress, self.pixels = progress, size[0] * size[1]
         self.total, self.before = views * self.pixels, 0
 
-    def within(self, done: int, _: int) -> None:
+    def within_view(self, done: int, _: int) -> None:
         """Called by the renderer of one view."""
         if self.progress is not None:
             self.progress(self.before + done, self.total)
         self.before += self.pixels if done == self.pixels else 0
 
 
-def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path) -> dict[str, Any]:
-    """Write the images of a view, and give its row of the metrics."""
+def _row(
+    view: RenderedView, brightness: Brightness, metrics: Mapping[str, Metric], folder: Path
+) -> dict[str, Any]:
+    """Write the images of a view; returns its row of `metrics.json`."""
     reference = view.reference
     image = brightness.image(view.light)
     name = f"{reference.frame:04d}"
@@ -157,9 +178,9 @@ def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path
         "reference": reference.kind or None,
     }
     if reference.image is None:
-        row |= dict.fromkeys(NAMES)
+        row |= dict.fromkeys(metrics)
     else:
-        row |= score(image, brightness.reference(reference.image), lpips)
+        row |= score(image, brightness.reference(reference.image), metrics)
     return row | {
         "seconds": round(view.seconds, 3),
         "image": f"renders/{folder.name}/{name}.png",
@@ -167,14 +188,14 @@ def _judge(view: View, brightness: Brightness, lpips: Lpips | None, folder: Path
     }
 
 
-def _more(
+def _capture_metrics(
     model: Model,
     capture: Capture,
-    views: list[View],
+    views: list[RenderedView],
     brightness: Brightness,
     events: Mapping[str, Any] | None,
 ) -> dict[str, float]:
-    """What else the truth allows to measure on held-out views."""
+    """Metrics that need events or depth of the capture, over all held-out views."""
     found: dict[str, float] = {}
     if events is not None:
         longest = max(events["lengths"], key=float)
@@ -182,25 +203,31 @@ def _more(
         found |= {name: scores[name] for name in ("event_psnr", "event_mae")}
     pairs = [(view.light, image) for view in views if (image := view.reference.image) is not None]
     if pairs and capture.events is not None:
-        found["psnr_aligned"] = math.fsum(
-            aligned_psnr(brightness.image(light), brightness.reference(image), HIGHEST_PSNR)
+        found[PSNR_ALIGNED.name] = math.fsum(
+            aligned_psnr(brightness.image(light), brightness.reference(image))
             for light, image in pairs
         ) / len(pairs)
     frames = capture.frames
     if frames is not None and frames.depth is not None and views:
-        whole = isinstance(renderer_of(model), ViewRenderer)
+        whole_views = isinstance(renderer_of(model), ViewRenderer)
         truth = [frames.depth[view.reference.frame] for view in views]
-        if not whole:
+        if not whole_views:  # the depth of rays is a distance, weighted by opacity
             truth = [distances(one, capture.camera) for one in truth]
-        drawn = [v.depth if whole else v.depth / v.opacity.clamp_min(TRACE) for v in views]
-        error = depth_error(drawn, [view.opacity for view in views], truth)
+        rendered = [
+            view.depth if whole_views else view.depth / view.opacity.clamp_min(LEAST_OPACITY)
+            for view in views
+        ]
+        error = scaled_depth_error(rendered, [view.opacity for view in views], truth)
         if error is not None:
-            found["depth_error"] = error
+            found[DEPTH_ERROR.name] = error
     return found
 
 
-def _summary(
-    rows: list[dict[str, Any]], views: list[View], brightness: Brightness, lpips: Lpips | None
+def _train_summary(
+    rows: list[dict[str, Any]],
+    views: list[RenderedView],
+    brightness: Brightness,
+    metrics: Mapping[str, Metric],
 ) -> dict[str, Any]:
     """Means over training views with known truth, and how their blurred input scores there."""
     inputs = []
@@ -214,18 +241,18 @@ def _summary(
         if truth is not None:
             truth = brightness.reference(truth)
             row["sharpness"]["truth"] = float(laplacian_variance(truth))
-            row["input"] = score(measured, truth, lpips)
+            row["input"] = score(measured, truth, metrics)
             inputs.append(row["input"])
     return {
         "count": len(inputs),
-        "mean": mean(row for row in rows if row["reference"]),
-        "input": {"mean": mean(inputs)},
+        "mean": mean((row for row in rows if row["reference"]), metrics),
+        "input": {"mean": mean(inputs, metrics)},
         "views": rows,
     }
 
 
 def _training(run: Path) -> dict[str, Any]:
-    """What training wrote about its cost."""
+    """The cost of training, from `training.json`."""
     path = run / "training.json"
     cost: dict[str, Any] = dict.fromkeys(("steps", "seconds", "peak_memory_mb"))
     if not path.is_file():
@@ -237,7 +264,7 @@ def _training(run: Path) -> dict[str, Any]:
         raise RunError("cannot be read", where=path, got=error, do="train anew") from None
 
 
-def _same_size(model: Model, capture: Capture) -> None:
+def _expect_same_size(model: Model, capture: Capture) -> None:
     if capture.frames is not None and capture.camera.size != model.capture.camera.size:
         raise OptionError(
             "the model was trained at another image size",

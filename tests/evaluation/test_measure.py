@@ -10,8 +10,8 @@ import torch
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.evaluate import Measuring, evaluate
-from sharpfield.evaluation.report import Story, write_report
+from sharpfield.evaluation.measure import EvaluationOptions, evaluate
+from sharpfield.evaluation.report import RunDescription, write_report
 from sharpfield.evaluation.views import validation
 from sharpfield.metrics.lpips import BACKBONES, Lpips
 from tests.evaluation.fake import CAMERA, Sky, capture
@@ -61,7 +61,7 @@ def test_a_model_in_colour_is_compared_with_grey_frames_by_its_luma(tmp_path: Pa
     metrics = evaluate(Sky(grey), grey, tmp_path)
     assert metrics["protocol"]["compared_as"] == "luma"
     assert 5 < metrics["mean"]["psnr"] < 50
-    write_report(tmp_path, grey, metrics, Story("grey"))
+    write_report(tmp_path, grey, metrics, RunDescription("grey"))
 
 
 def test_validation_says_what_evaluation_says(tmp_path: Path):
@@ -71,7 +71,7 @@ def test_validation_says_what_evaluation_says(tmp_path: Path):
     assert score(Sky(capture(), gain=0.8)) == pytest.approx(metrics["mean"]["psnr"], abs=1e-3)
     blind = capture().without(frames=True)
     metrics = evaluate(
-        Sky(blind, gain=0.2), capture(), tmp_path, measuring=Measuring(train_views=0)
+        Sky(blind, gain=0.2), capture(), tmp_path, options=EvaluationOptions(train_views=0)
     )
     assert score(Sky(blind, gain=0.2)) == pytest.approx(metrics["mean"]["psnr"], abs=1e-3)
     assert validation(capture(test=())) is None
@@ -108,7 +108,7 @@ def test_given_poses_replace_those_of_the_capture(tmp_path: Path):
         Sky(whole),
         whole,
         tmp_path,
-        measuring=Measuring(poses=elsewhere, stated={"pose_refinement": "by hand"}),
+        options=EvaluationOptions(poses=elsewhere, stated={"pose_refinement": "by hand"}),
     )
     assert metrics["views"][0]["psnr"] < 30 < 50 < metrics["views"][1]["psnr"]
     assert metrics["protocol"]["pose_refinement"] == "by hand"
@@ -165,7 +165,7 @@ def test_events_alone_are_aligned_in_log_intensity(tmp_path: Path, bayer: str):
 def test_a_model_whose_recipe_left_the_frames_out_can_be_called_blind(tmp_path: Path):
     dim = Sky(capture(), gain=0.5)
     plain = evaluate(dim, capture(), tmp_path)
-    blind = evaluate(dim, capture(), tmp_path, measuring=Measuring(events_only=True))
+    blind = evaluate(dim, capture(), tmp_path, options=EvaluationOptions(events_only=True))
     assert plain["protocol"]["alignment"] is None
     assert blind["protocol"]["alignment"] is not None
     assert blind["mean"]["psnr"] > plain["mean"]["psnr"]
@@ -185,14 +185,16 @@ def test_lpips_is_null_with_a_reason_or_a_number_with_its_weights(tmp_path: Path
     assert without["mean"]["lpips"] is None
     assert without["protocol"]["lpips"]["computed"] is False
     assert "alexnet-owt-7be5be79.pth" in without["protocol"]["lpips"]["enable"]
-    measuring = Measuring(lpips=random_lpips())
-    found = evaluate(Sky(capture(), gain=0.5), capture(), tmp_path, measuring=measuring)
+    measuring = EvaluationOptions(lpips=random_lpips())
+    found = evaluate(Sky(capture(), gain=0.5), capture(), tmp_path, options=measuring)
     assert found["mean"]["lpips"] > 0
     assert found["protocol"]["lpips"]["backbone"] == "b"
 
 
 def test_the_number_of_training_views_can_be_limited(tmp_path: Path):
-    metrics = evaluate(Sky(capture()), capture(), tmp_path, measuring=Measuring(train_views=2))
+    metrics = evaluate(
+        Sky(capture()), capture(), tmp_path, options=EvaluationOptions(train_views=2)
+    )
     assert [view["frame"] for view in metrics["train_views"]["views"]] == [1, 5]
 
 
@@ -212,7 +214,7 @@ def test_progress_counts_all_pixels(tmp_path: Path):
         Sky(capture()),
         capture(),
         tmp_path,
-        measuring=Measuring(chunk=500),
+        options=EvaluationOptions(chunk=500),
         progress=lambda *done: said.append(done),
     )
     total = 6 * CAMERA.width * CAMERA.height

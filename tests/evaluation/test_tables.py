@@ -1,6 +1,5 @@
-from html.parser import HTMLParser
-
-from sharpfield.report.tables import as_html, markdown, methods_table, views_table
+from sharpfield.evaluation.tables import methods_table, reported_metrics, views_table
+from sharpfield.report.tables import markdown
 
 MEAN = {"psnr": 31.239, "ssim": 0.91234, "ssim_paper": 0.9, "lpips": None}
 METRICS = {
@@ -40,7 +39,9 @@ def test_views_end_with_their_mean_and_may_show_their_input():
     assert len(views_table(views, MEAN).columns) == 4
 
 
-def test_html_escapes_and_marks():
-    text = as_html(methods_table(METRICS))
-    assert "&lt;edi&gt;" in text and text.count('class="best"') == 3
-    HTMLParser().feed(text)
+def test_metrics_of_depth_alignment_and_events_have_columns():
+    mean = MEAN | {"psnr_aligned": 33.0, "depth_error": 0.0712, "event_psnr": 30.04}
+    table = methods_table({"mean": mean})
+    assert table.columns[-3:] == ("aligned PSNR (dB)", "depth error", "event PSNR (dB)")
+    assert table.rows[0][-3:] == ("33.00", "0.0712", "30.04")
+    assert {"event_f1", "none_psnr", "lpips"} <= reported_metrics().keys()
