@@ -19,9 +19,9 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.read import read
 from sharpfield.cli.arguments import parse_size
-from sharpfield.cli.runs import changed
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.options import changed
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start

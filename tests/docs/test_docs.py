@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 from sharpfield.cli import main as command_line
-from sharpfield.cli.runs import changed
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
 from sharpfield.recipes.choose import presets_of
+from sharpfield.recipes.options import changed
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "notebook.md"]
@@ -68,8 +68,8 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Call]:
 
         return note
 
-    for command, function in list(command_line.COMMANDS.items()):
-        monkeypatch.setitem(command_line.COMMANDS, command, noting(command, function))
+    load = command_line.load
+    monkeypatch.setattr(command_line, "load", lambda command: noting(command, load(command)))
 
     def parsed(line: str) -> Call:
         command_line.main(shlex.split(line, comments=True)[1:])

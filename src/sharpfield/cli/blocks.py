@@ -4,6 +4,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from tyro.conf import Positional
@@ -11,10 +12,12 @@ from tyro.conf import Positional
 from sharpfield.captures.blocks import blocks_of
 from sharpfield.captures.read import read
 from sharpfield.cli.arguments import Device, screen
-from sharpfield.cli.runs import OPTIONS, READING, Choice, changed
+from sharpfield.cli.recipe_options import hint_at_flags
+from sharpfield.cli.runs import OPTIONS, READING, Choice
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.options import changed, with_options
 from sharpfield.recipes.splats.merge import merge
 from sharpfield.runs.config import (
     ReadOptions,
@@ -54,6 +57,7 @@ def blocks(
     choice: Cut = CUT,
     options: Options = OPTIONS,
     reading: ReadOptions = READING,
+    numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Train a long capture in overlapping blocks, and merge them into one run.
 
@@ -70,13 +74,15 @@ def blocks(
         choice: Presets, streams, single numbers, blocks.
         options: How long, how often to save, how much memory; for each block.
         reading: What to believe instead of the capture's layout.
+        numbers: Options of the recipe by name, such as sampling.views.
     """
     if choice.block:
         raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
+    hint_at_flags(recipe, choice.change)
     console, where, count = screen(), device_named(device), choice.count
     source = read(capture, **reading.given())
     made = prepared(recipe, choice.preset, capture=source, device=where)
-    made = changed(made, choice.change)
+    made = with_options(changed(made, choice.change), numbers)
     whole = RunConfig(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
     started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]

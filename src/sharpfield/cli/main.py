@@ -1,63 +1,87 @@
-"""The command line: a command for each verb, errors in words, exit code 2 for what you can mend."""
+"""The command line: a command for each verb, errors in words, exit code 2 for what you can mend.
 
+A command is imported when it is called, so that help and mistakes cost no start-up time.
+"""
+
+import os
 import sys
+import textwrap
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import tyro
 
-from sharpfield.cli.blocks import blocks
-from sharpfield.cli.calibrate import calibrate
-from sharpfield.cli.captures import deblur, footage, inspect, simulate
-from sharpfield.cli.demo import demo
-from sharpfield.cli.doctor import doctor
-from sharpfield.cli.events import events
-from sharpfield.cli.export import export
-from sharpfield.cli.ingest import ingest
-from sharpfield.cli.poses import poses
-from sharpfield.cli.quality import blur, quality
-from sharpfield.cli.recipes import recipes
-from sharpfield.cli.runs import evaluate, render, train
-from sharpfield.core.errors import SharpfieldError
+from sharpfield import __version__
+from sharpfield.cli import recipe_options
+from sharpfield.core.errors import Hint, OptionError, SharpfieldError, did_you_mean
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "demo": demo,
-    "simulate": simulate,
-    "footage": footage,
-    "ingest": ingest,
-    "inspect": inspect,
-    "deblur": deblur,
-    "quality": quality,
-    "blur": blur,
-    "doctor": doctor,
-    "poses": poses,
-    "calibrate": calibrate,
-    "train": train,
-    "blocks": blocks,
-    "evaluate": evaluate,
-    "render": render,
-    "events": events,
-    "export": export,
-    "recipes": recipes,
+
+@dataclass(frozen=True)
+class Command:
+    """A command, before it is imported."""
+
+    function: str
+    """`module:name`, the module in `sharpfield.cli`."""
+    does: str
+    """One line for the list of commands."""
+    recipe: bool = False
+    """Whether the options of a recipe are options of the command."""
+
+
+GROUPS: dict[str, dict[str, Command]] = {
+    "make data": {
+        "demo": Command("demo:demo", "record a scene, rebuild it by three methods, compare them"),
+        "simulate": Command("captures:simulate", "record a scene with simulated cameras"),
+        "footage": Command("captures:footage", "make blurry frames and events of sharp images"),
+    },
+    "prepare": {
+        "ingest": Command("ingest:ingest", "make a capture of what a camera has recorded"),
+        "inspect": Command("captures:inspect", "say what a capture, or a file of events, holds"),
+        "deblur": Command("captures:deblur", "sharpen frames with their events, without training"),
+        "quality": Command("quality:quality", "say which frames of a video are sharp"),
+        "blur": Command("quality:blur", "blur sharp images by random motion kernels"),
+        "doctor": Command("doctor:doctor", "check a capture before training"),
+        "poses": Command("poses:poses", "find camera poses, or attach those of other programs"),
+        "calibrate": Command("calibrate:calibrate", "measure contrast thresholds, find odd pixels"),
+    },
+    "learn": {
+        "train": Command("runs:train", "train a recipe on a capture", recipe=True),
+        "blocks": Command("blocks:blocks", "train a long capture in blocks", recipe=True),
+    },
+    "look": {
+        "evaluate": Command("runs:evaluate", "measure a run: metrics.json and report.html"),
+        "render": Command("runs:render", "render a video or images along a camera path"),
+        "events": Command("events:events", "render the events a camera would report in a scene"),
+        "export": Command("export:export", "write the Gaussians of a run as a .ply"),
+    },
+    "tools": {
+        "recipes": Command("recipes:recipes", "list recipes, describe one, say how to cite it"),
+    },
 }
+COMMANDS = {name: one for commands in GROUPS.values() for name, one in commands.items()}
 
 ABOUT = "Sharp radiance fields from motion-blurred frames and event-camera streams."
-
-INTERRUPTED = 130
+MENDABLE, INTERRUPTED, CLOSED = 2, 130, 141
+"""Exit codes: the user can mend it; interrupted; what reads the output has closed it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command and exit: 0 done, 2 the user can mend it, 130 interrupted."""
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="sharpfield",
-            description=ABOUT,
-            args=list(sys.argv[1:] if arguments is None else arguments),
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", Hint)
+            warnings.showwarning = _as_one_line(warnings.showwarning)
+            _run(list(sys.argv[1:] if arguments is None else arguments))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(CLOSED)
     except SharpfieldError as error:
         print(error, file=sys.stderr)
-        sys.exit(2)
+        sys.exit(MENDABLE)
     except OSError as error:
         if not error.strerror:
             raise
@@ -67,6 +91,60 @@ def main(arguments: Sequence[str] | None = None) -> None:
             do="check that the path exists, may be read or written, and has room",
         )
         print(said, file=sys.stderr)
-        sys.exit(2)
+        sys.exit(MENDABLE)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _run(words: list[str]) -> None:
+    """Run the command that the first word names.
+
+    Raises:
+        OptionError: There is no such command.
+    """
+    name, *options = words or ["--help"]
+    if name in ("-h", "--help"):
+        print(usage())
+    elif name == "--version":
+        print(f"sharpfield {__version__}")
+    elif name not in COMMANDS:
+        raise OptionError("unknown command", got=name, do=did_you_mean(name, COMMANDS))
+    else:
+        _call(name, options)
+
+
+def _call(name: str, words: list[str]) -> None:
+    """Run a command with the options that are given in words."""
+    config: tuple[Any, ...] = (tyro.conf.FlagCreatePairsOff,)
+    if COMMANDS[name].recipe:
+        recipe_options.expect_recipe(words)  # before anything heavy is imported
+        function, words = recipe_options.with_recipe_flags(load(name), words)
+    else:
+        function, config = load(name), (*config, tyro.conf.OmitArgPrefixes)
+    tyro.cli(function, prog=f"sharpfield {name}", args=words, config=config)
+
+
+def load(name: str) -> Callable[..., None]:
+    """The function of a command."""
+    module, _, function = COMMANDS[name].function.partition(":")
+    return getattr(import_module(f"sharpfield.cli.{module}"), function)
+
+
+def usage() -> str:
+    """All commands by what they are for."""
+    lines = ["usage: sharpfield COMMAND ...   or   sharpfield --version", "", ABOUT]
+    for group, commands in GROUPS.items():
+        lines += ["", group, *(f"  {name:<10} {one.does}" for name, one in commands.items())]
+    return "\n".join([*lines, "", "`sharpfield COMMAND --help` lists the options of a command."])
+
+
+def _as_one_line(usual: Callable[..., None]) -> Callable[..., None]:
+    """Print hints without the place in the code; other warnings as usual."""
+
+    def show(message: Any, category: type[Warning], *where: Any) -> None:
+        if not issubclass(category, Hint):
+            usual(message, category, *where)
+            return
+        print(textwrap.shorten(f"note: {message}", 400), file=sys.stderr)
+
+    return show

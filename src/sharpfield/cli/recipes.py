@@ -1,30 +1,31 @@
-"""What recipes there are, what they do, and whom to cite."""
+"""`sharpfield recipes`: what recipes there are, what they do, and whom to cite."""
 
-import dataclasses
 import textwrap
 from typing import Any, Literal
 
 from tyro.conf import Positional
 
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes import RECIPES, recipe_named, summaries, summary_of
 from sharpfield.recipes.choose import presets_of
+from sharpfield.recipes.options import Option, options_of
 
 WIDTH = 96
+COLUMN = 34
 
 
 def recipes(
     what: Positional[Literal["list", "describe", "cite"]] = "list", name: Positional[str] = ""
 ) -> None:
-    """List recipes, describe one with its numbers, or print how to cite it.
+    """List recipes, describe one with its presets and options, or print how to cite it.
 
     Args:
-        what: What to say.
-        name: Of the recipe, for describe and cite.
+        what: What to print.
+        name: Name of the recipe, for describe and cite.
     """
     if what == "list":
-        for known, recipe in RECIPES.working().items():
-            print(f"{known:<18} {_first_line(recipe)}")
+        for known, summary in summaries().items():
+            print(f"{known:<18} {summary}")
         return
     if not name:
         raise OptionError(f"which recipe? {what} needs a name", do=f"use {', '.join(RECIPES)}")
@@ -33,24 +34,31 @@ def recipes(
 
 
 def _described(name: str, recipe: Any) -> str:
-    lines = [f"{name}: {recipe.paper.title}", "", _first_line(recipe), ""]
-    if known := presets_of(recipe).all:
-        lines.append("presets")
-        lines += [f"  {preset:<16} {_first_line(change)}" for preset, change in known.items()]
-        lines.append("")
-    lines += ["numbers (train --change NAME=VALUE)", *_numbers(recipe())]
+    """Presets with what they change, then options with their defaults and meanings."""
+    default = options_of(recipe())
+    lines = [f"{name}: {recipe.paper.title}", "", summary_of(recipe), ""]
+    if presets := presets_of(recipe).all:
+        lines.append("presets (--preset NAME, or several with commas between them)")
+    for preset, change in presets.items():
+        lines.append(f"  {preset:<16} {summary_of(change)}")
+        for option, after in options_of(change(recipe())).items():
+            if option not in default or after.value != default[option].value:
+                before = _text(default[option]) if option in default else "none"
+                lines.append(f"      {option:<{COLUMN - 4}} {before} -> {_text(after)}")
+    lines += ["", f"options (train {name} CAPTURE --OPTION VALUE), with their defaults"]
+    for option in default.values():
+        lines.append(f"  {option.name:<{COLUMN}} {_text(option)}")
+        lines += textwrap.wrap(
+            option.meaning, WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
+        )
     return "\n".join(lines)
 
 
-def _numbers(recipe: Any, before: str = "") -> list[str]:
-    lines = []
-    for field in dataclasses.fields(recipe):
-        value = getattr(recipe, field.name)
-        if dataclasses.is_dataclass(value):
-            lines += _numbers(value, f"{before}{field.name}.")
-        else:
-            lines.append(f"  {before + field.name:<28} {value}")
-    return lines
+def _text(option: Option) -> str:
+    """A value as it is written on the command line."""
+    if isinstance(option.value, tuple):
+        return " ".join(str(one) for one in option.value)
+    return '""' if option.value == "" else str(option.value)
 
 
 def _cited(recipe: Any) -> str:
@@ -63,7 +71,3 @@ def _cited(recipe: Any) -> str:
             for departure in paper.departures
         ]
     return "\n".join(lines)
-
-
-def _first_line(recipe: Any) -> str:
-    return (recipe.__doc__ or "").strip().splitlines()[0]

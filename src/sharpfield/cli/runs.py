@@ -1,8 +1,9 @@
 """Commands about runs: train one, measure one, render one."""
 
-import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,12 +14,12 @@ from tyro.conf import Positional
 
 from sharpfield.captures.read import read
 from sharpfield.cli.arguments import Device, screen
-from sharpfield.core.errors import OptionError
+from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.evaluation.paths import camera_path
 from sharpfield.evaluation.refine import Refinement
-from sharpfield.evaluation.report import flat
 from sharpfield.metrics.lpips import load_lpips
 from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.options import changed, with_options
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.video import write_video
 from sharpfield.runs.config import ReadOptions, RunConfig, device_named
@@ -41,7 +42,7 @@ class Choice:
     block: str = ""
     """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
     change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
-    """Single numbers of the recipe, such as events.weight=0 frames.instants=7."""
+    """Options of the recipe, as events.weight=0; better written --events.weight 0."""
 
 
 CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), ReadOptions(), Refinement()
@@ -56,6 +57,7 @@ def train(
     choice: Choice = CHOICE,
     options: Options = OPTIONS,
     reading: ReadOptions = READING,
+    numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Train a recipe on a capture.
 
@@ -68,11 +70,13 @@ def train(
         choice: Presets, streams, single numbers.
         options: How long, how often to save, how much memory.
         reading: What to believe instead of the capture's layout.
+        numbers: Options of the recipe by name, such as sampling.views.
     """
+    hint_at_flags(recipe, choice.change)
     console, where = screen(), device_named(device)
     source = read(capture, **reading.given())
     made = prepared(recipe, choice.preset, capture=source, device=where)
-    made = changed(made, choice.change)
+    made = with_options(changed(made, choice.change), numbers)
     where_from, given = str(capture.resolve()), reading.given()
     started = RunConfig(recipe, made, where_from, seed, choice.use, given, choice.block)
     trained = start(started, source, out, options, device=where, console=console)
@@ -160,31 +164,3 @@ def render(
 def eight_bit(image: torch.Tensor) -> np.ndarray:
     """Stored values 0...1 as bytes."""
     return (image.clamp(0, 1) * EIGHT_BIT).round().byte().cpu().numpy()
-
-
-def changed(recipe: Any, changes: tuple[str, ...]) -> Any:
-    """A recipe with some of its numbers changed by name.
-
-    Raises:
-        OptionError: A change is not NAME=VALUE, or the recipe has no such number.
-    """
-    known, words = set(flat(dataclasses.asdict(recipe))), []
-    for change in changes:
-        name, equals, value = change.partition("=")
-        if not equals or name not in known:
-            raise OptionError(
-                "cannot read a change of the recipe",
-                got=change,
-                do=f"write NAME=VALUE with one of {', '.join(sorted(known))}",
-            )
-        words += [f"--{name}", *value.split(",")]
-    if not words:
-        return recipe
-    # Without flags, so that a boolean takes its value like every other number: NAME=False.
-    return tyro.cli(
-        type(recipe),
-        prog="--change",
-        default=recipe,
-        args=words,
-        config=(tyro.conf.FlagConversionOff,),
-    )

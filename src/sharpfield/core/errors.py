@@ -54,10 +54,10 @@ class Hint(UserWarning):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """What to do about an unknown name: the known ones, the most similar first."""
+    """What to do about an unknown name: the known ones like it, or all where none is like it."""
     names = list(known)
-    if close := get_close_matches(name, names, n=1):
-        return f"did you mean {close[0]}? There are {', '.join(names)}"
+    if close := get_close_matches(name, names, n=2, cutoff=0.5):
+        return f"did you mean {' or '.join(close)}?"
     return f"use one of {', '.join(names)}" if names else "leave it out: there is none"
 
 

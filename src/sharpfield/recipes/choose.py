@@ -8,11 +8,13 @@ states its presets in the class variable `presets`, also a recipe of another pac
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sharpfield.core.capture import Capture
 from sharpfield.core.errors import Hint, OptionError, did_you_mean
 from sharpfield.recipes import recipe_named
+
+if TYPE_CHECKING:  # a list of recipes needs no torch
+    from sharpfield.core.capture import Capture
 
 Change = Callable[[Any], Any]
 """From a recipe to a changed one; the first line of its docstring says what it means."""
@@ -26,7 +28,7 @@ class Presets:
     """What is modelled. They are applied before the size."""
     sizes: Mapping[str, Change] = field(default_factory=dict)
     """How much of it. Where none is named, a CPU gets `draft` and a GPU `standard`."""
-    variant_for: Callable[[Capture, str], str] | None = None
+    variant_for: Callable[["Capture", str], str] | None = None
     """The variant for a capture and a size, where none is named; None for none."""
     renamed: Mapping[str, str] = field(default_factory=dict)
     """Old names, accepted with a hint."""
@@ -50,8 +52,7 @@ class Presets:
             if name not in self.all:
                 raise OptionError(
                     f"the recipe {recipe} has no preset {name!r}",
-                    do=did_you_mean(name, self.all)
-                    + (", or several with commas between them" if self.all else ""),
+                    do=did_you_mean(name, self.all),
                 )
         return names
 
@@ -70,7 +71,7 @@ def presets_of(recipe: Any) -> Presets:
     return getattr(recipe, "presets", NO_PRESETS)
 
 
-def prepared(name: str, preset: str = "", *, capture: Capture, device: str) -> Any:
+def prepared(name: str, preset: str = "", *, capture: "Capture", device: str) -> Any:
     """A recipe with presets applied; what `preset` leaves open follows capture and machine.
 
     Args:

@@ -27,7 +27,9 @@ class Lengths:
     """How long windows are, and which part of the recording they lie in; in shares of it."""
 
     shortest: float = 1 / 256
+    """Share of the recording that the shortest window lasts."""
     longest: float = 1.0
+    """Share of the recording that the longest window lasts."""
     until: float = 1.0
     """Windows lie between the beginning and this."""
 

@@ -1,0 +1,172 @@
+"""Options of a recipe as flags of the commands that train one.
+
+The flags are made from the recipe's dataclass once its name is known: `--sampling.views 5`. Named
+presets change the defaults that the help shows; a flag wins over every preset.
+"""
+
+import dataclasses
+import functools
+import inspect
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, get_type_hints
+
+import tyro
+
+from sharpfield.core.errors import Hint, OptionError, did_you_mean
+from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes.choose import presets_of
+from sharpfield.recipes.options import changed, field_texts, new_name, options_of
+
+NOT_FLAGS = ("steps",)
+"""Fields of recipes that have a flag of the command: `--steps` also stretches the schedule."""
+
+Numbers = dict[str, Any]
+"""Options that were given, by name."""
+
+
+def expect_recipe(words: Sequence[str]) -> None:
+    """Refuse a first word that is neither an option nor the name of a recipe.
+
+    Raises:
+        OptionError: It is one.
+    """
+    if words and not words[0].startswith("-") and words[0] not in RECIPES:
+        raise OptionError("unknown recipe", got=words[0], do=did_you_mean(words[0], RECIPES))
+
+
+def recipe_in(words: Sequence[str]) -> str | None:
+    """The name of a recipe among the words of a command, where it is not the value of an option."""
+    pairs = zip(["", *words], words, strict=False)
+    return next((b for a, b in pairs if b in RECIPES and not a.startswith("--")), None)
+
+
+def with_recipe_flags(
+    command: Callable[..., None], words: Sequence[str]
+) -> tuple[Callable[..., None], list[str]]:
+    """A command with a flag for each option of the recipe that is named, and its words.
+
+    Args:
+        command: Its parameter `numbers` gets the options that were given.
+        words: On the command line; old names of options are replaced, with a hint.
+    """
+    signature = inspect.signature(command)
+    others = [one for one in signature.parameters.values() if one.name != "numbers"]
+    name = recipe_in(words)
+    if name is None:
+        return _with_parameters(command, others, lambda options: options), list(words)
+    recipe = recipe_named(name)()
+    words = [_renamed(recipe, word) for word in words]
+    presets = presets_of(recipe)
+    recipe = presets.apply(presets.named(_value_of("--preset", words), name), recipe)
+    taken = _flags_of(others)
+    kind = _flags(recipe, taken, name)
+    flags = {word[2:].partition("=")[0].replace("-", "_") for word in words if word[:2] == "--"}
+    given = [one for one in options_of(recipe) if _flag(one, taken) in flags]
+    parameter = inspect.Parameter(
+        "numbers",
+        inspect.Parameter.KEYWORD_ONLY,
+        default=kind(*(getattr(recipe, one.name) for one in dataclasses.fields(kind))),
+        annotation=Annotated[kind, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff],
+    )
+
+    def with_numbers(options: dict[str, Any]) -> dict[str, Any]:
+        made = options["numbers"]
+        numbers = {one: functools.reduce(getattr, one.split("."), made) for one in given}
+        return {**options, "numbers": numbers}
+
+    return _with_parameters(command, [*others, parameter], with_numbers), words
+
+
+def hint_at_flags(recipe: str, changes: Sequence[str]) -> None:
+    """Say how what `--change` does is written now.
+
+    Raises:
+        OptionError: A change is not NAME=VALUE, or the recipe has no such option.
+    """
+    if changes:
+        changed(recipe_named(recipe)(), changes)
+        flags = (change.replace("=", " ", 1).replace(",", " ") for change in changes)
+        said = " ".join(f"--{flag}" for flag in flags)
+        warnings.warn(f"--change will go; write {said}", Hint, stacklevel=2)
+
+
+def _flags(recipe: Any, taken: set[str], name: str) -> type:
+    """A dataclass with the fields of a recipe that become flags.
+
+    Args:
+        recipe: Its values are the defaults.
+        taken: Flags of the command; a field of such a name gets the flag `--recipe.NAME`.
+        name: Of the recipe.
+    """
+    kinds, meanings = get_type_hints(type(recipe)), field_texts(type(recipe))
+    fields: list[tuple[str, Any, Any]] = []
+    for one in dataclasses.fields(recipe):
+        value = getattr(recipe, one.name)
+        if one.name in NOT_FLAGS:
+            continue
+        flag = tyro.conf.arg(
+            name=f"recipe.{one.name}" if one.name in taken else None, help=meanings.get(one.name)
+        )
+        fields.append(
+            (one.name, Annotated[kinds[one.name], flag], dataclasses.field(default=value))
+        )
+    return dataclasses.make_dataclass(
+        "Numbers", fields, frozen=True, namespace={"__doc__": f"Options of {name}."}
+    )
+
+
+def _flag(option: str, taken: set[str]) -> str | None:
+    """The flag of an option; None for those that are none."""
+    if option in NOT_FLAGS:
+        return None
+    return f"recipe.{option}" if option in taken else option
+
+
+def _flags_of(parameters: list[inspect.Parameter]) -> set[str]:
+    """Names of the flags of a command, those of its groups of options, too."""
+    groups = [one.annotation for one in parameters if dataclasses.is_dataclass(one.annotation)]
+    fields = {field.name for group in groups for field in dataclasses.fields(group)}
+    return fields | {one.name for one in parameters}
+
+
+def _with_parameters(
+    command: Callable[..., None],
+    parameters: list[inspect.Parameter],
+    change: Callable[[dict[str, Any]], dict[str, Any]],
+) -> Callable[..., None]:
+    @functools.wraps(command)
+    def call(*positional: Any, **options: Any) -> None:
+        command(*positional, **change(options))
+
+    del call.__wrapped__
+    signature = inspect.signature(command)
+    parameters = [
+        one.replace(annotation=tyro.conf.OmitArgPrefixes[one.annotation])
+        if one.name != "numbers"
+        else one
+        for one in parameters
+    ]
+    call.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore
+    call.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
+    return call
+
+
+def _value_of(flag: str, words: Sequence[str]) -> str:
+    for word, after in zip(words, [*words[1:], ""], strict=True):
+        name, equals, value = word.partition("=")
+        if name == flag:
+            return value if equals else after
+    return ""
+
+
+def _renamed(recipe: Any, word: str) -> str:
+    """An option with its name of today."""
+    if not word.startswith("--"):
+        return word
+    name, equals, value = word[2:].partition("=")
+    new = new_name(recipe, name.replace("-", "_"))
+    if new == name.replace("-", "_"):
+        return word
+    warnings.warn(f"the option --{name} is now --{new}", Hint, stacklevel=2)
+    return f"--{new}{equals}{value}"
