@@ -17,9 +17,10 @@ from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur_to
 from sharpfield.preparation.deblur import deblur as deblur_capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.options import with_options
 from sharpfield.recordings.open import open_recording
 from sharpfield.runs.captures import LayoutName, write
-from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named, with_options
+from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.by_name import (

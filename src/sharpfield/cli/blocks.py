@@ -52,7 +52,6 @@ def blocks(
     recipe: Positional[str],
     capture: Positional[Path],
     out: Path,
-    seed: int = 0,
     device: Device = "auto",
     choice: Cut = CUT,
     options: Options = OPTIONS,
@@ -69,7 +68,6 @@ def blocks(
         recipe: One of those made of Gaussians, such as room-splat.
         capture: Folder of the capture.
         out: Folder of the merged run; the blocks' own runs are in it.
-        seed: Of everything random.
         device: Where to train.
         choice: Presets, streams, single numbers, blocks.
         options: How long, how often to save, how much memory; for each block.
@@ -83,7 +81,9 @@ def blocks(
     source = read(capture, **reading.given())
     made = prepared(recipe, choice.preset, capture=source, device=where)
     made = with_options(changed(made, choice.change), numbers)
-    whole = RunConfig(recipe, made, str(capture.resolve()), seed, choice.use, reading.given())
+    whole = RunConfig(
+        recipe, made, str(capture.resolve()), choice.seed, choice.use, reading.given()
+    )
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
     started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
     for run, block in zip(runs, started, strict=True):

@@ -41,6 +41,8 @@ class Choice:
     """Streams of the capture to learn from."""
     block: str = ""
     """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
+    seed: int = 0
+    """Random seed."""
     change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
     """Options of the recipe, as events.weight=0; better written --events.weight 0."""
 
@@ -52,7 +54,6 @@ def train(
     recipe: Positional[str],
     capture: Positional[Path],
     out: Path,
-    seed: int = 0,
     device: Device = "auto",
     choice: Choice = CHOICE,
     options: Options = OPTIONS,
@@ -65,7 +66,6 @@ def train(
         recipe: Its name; `sharpfield recipes` lists them.
         capture: Folder of the capture.
         out: Folder of the run.
-        seed: Of everything random.
         device: Where to train.
         choice: Presets, streams, single numbers.
         options: How long, how often to save, how much memory.
@@ -78,7 +78,7 @@ def train(
     made = prepared(recipe, choice.preset, capture=source, device=where)
     made = with_options(changed(made, choice.change), numbers)
     where_from, given = str(capture.resolve()), reading.given()
-    started = RunConfig(recipe, made, where_from, seed, choice.use, given, choice.block)
+    started = RunConfig(recipe, made, where_from, choice.seed, choice.use, given, choice.block)
     trained = start(started, source, out, options, device=where, console=console)
     if trained.ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")

@@ -8,6 +8,7 @@ import ast
 import dataclasses
 import inspect
 import textwrap
+import types
 import typing
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -52,13 +53,24 @@ def with_options(recipe: Any, values: Mapping[str, Any]) -> Any:
 
     Args:
         recipe: Stays as it is.
-        values: By the name of the option; old names are accepted with a hint.
+        values: By dotted name, such as `{"gaussians.degree": 3}`; old names are accepted with a
+            hint.
 
     Raises:
-        OptionError: The recipe has no such option.
+        OptionError: The recipe has no such option, or it takes another type of value.
     """
-    for name, value in values.items():
-        recipe = _replaced(recipe, current_name(recipe, name).split("."), value)
+    for given, value in values.items():
+        name = current_name(recipe, given)
+        option = options_of(recipe)[name]
+        if not _fits(value, option.kind):
+            raise OptionError(
+                f"the option {name!r} takes another type of value",
+                got=repr(value),
+                do=f"give {getattr(option.kind, '__name__', option.kind)}, such as"
+                f" {option.value!r}",
+            )
+        value = tuple(value) if isinstance(value, list) else value
+        recipe = _replaced(recipe, name.split("."), value)
     return recipe
 
 
@@ -138,3 +150,23 @@ def _texts(source: str) -> Iterator[tuple[str, str]]:
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
             if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
                 yield field.target.id, " ".join(str(below.value.value).split())
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value may stand where a dataclass field asks for a type."""
+    kind, inner = typing.get_origin(hint), typing.get_args(hint)
+    if kind in (types.UnionType, typing.Union):
+        return any(_fits(value, one) for one in inner)
+    if kind is typing.Literal:
+        return value in inner
+    if kind is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        if inner[-1:] == (...,):
+            return all(_fits(one, inner[0]) for one in value)
+        return len(value) == len(inner) and all(map(_fits, value, inner))
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return not isinstance(hint, type) or isinstance(value, hint)

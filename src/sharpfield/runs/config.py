@@ -7,8 +7,7 @@ import dataclasses
 import json
 import types
 import typing
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +16,7 @@ import torch
 from sharpfield.captures.blocks import blocks_of, limited, parsed
 from sharpfield.captures.read import read
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError, OptionError, RunError, did_you_mean
+from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.files import write_json
 from sharpfield.recipes import recipe_named
 
@@ -162,64 +161,6 @@ def _value(hint: Any, value: Any) -> Any:
         kinds = [k for k in typing.get_args(hint) if dataclasses.is_dataclass(k)]
         return from_table(typing.cast(type, kinds[0]), value)
     return value
-
-
-def with_options(recipe: Any, options: Mapping[str, Any]) -> Any:
-    """A recipe with some of its options changed.
-
-    Args:
-        recipe: A frozen dataclass, whose fields may be such dataclasses again.
-        options: New values by dotted name, such as `{"gaussians.degree": 3}`.
-
-    Raises:
-        OptionError: The recipe has no such option, or it takes another type of value.
-    """
-    for name, value in options.items():
-        recipe = _with_option(recipe, name, name.split("."), value)
-    return recipe
-
-
-def _with_option(part: Any, name: str, path: list[str], value: Any) -> Any:
-    first, *rest = path
-    fields = dataclasses.fields(part) if dataclasses.is_dataclass(part) else ()
-    known = [f.name for f in fields]
-    if first not in known:
-        raise OptionError(
-            f"unknown option {name!r}",
-            where=type(part).__name__,
-            do=did_you_mean(first, known),
-        )
-    hint = typing.get_type_hints(type(part))[first]
-    if rest:
-        value = _with_option(getattr(part, first), name, rest, value)
-    elif not _fits(value, hint):
-        raise OptionError(
-            f"the option {name!r} takes another type of value",
-            got=repr(value),
-            do=f"give {getattr(hint, '__name__', hint)}, such as {getattr(part, first)!r}",
-        )
-    changes = {first: tuple(value) if isinstance(value, list) else value}
-    return replace(typing.cast(Any, part), **changes)
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value may stand where a dataclass field asks for a type."""
-    kind, inner = typing.get_origin(hint), typing.get_args(hint)
-    if kind in (types.UnionType, typing.Union):
-        return any(_fits(value, one) for one in inner)
-    if kind is Literal:
-        return value in inner
-    if kind is tuple:
-        if not isinstance(value, tuple | list):
-            return False
-        if inner[-1:] == (...,):
-            return all(_fits(one, inner[0]) for one in value)
-        return len(value) == len(inner) and all(map(_fits, value, inner))
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return not isinstance(hint, type) or isinstance(value, hint)
 
 
 def device_named(name: str) -> str:
