@@ -11,8 +11,10 @@ import torch
 
 import sharpfield as sf
 from sharpfield._lazy import lazily, offers
+from sharpfield.simulation.sensors.event_pixels import EventSensor
 
 SOURCE = Path(__file__).parents[2] / "src"
+SENSITIVE = EventSensor(threshold_on=0.02, threshold_off=0.02)
 STILL = {"size": (24, 16), "frames": 6, "exposure_us": 20_000, "interval_us": 24_000}
 HEAVY = ("torch", "numba", "cv2", "numpy", "jaxtyping", "h5py", "matplotlib", "rich", "tyro")
 
@@ -198,3 +200,26 @@ def test_wrong_types_are_said_in_words(run: sf.Run) -> None:
         "this is not the size of a sensor | 5",
         "this is not the size of a sensor | ('8', 8)",
     ]
+
+
+def test_a_run_has_an_event_camera(run: sf.Run, capture: sf.Capture) -> None:
+    span = capture.clock.origin_us, capture.clock.origin_us + capture.clock.span_us
+    events = run.events(end=60_000, sensor=SENSITIVE)
+    assert (events.width, events.height) == capture.camera.size
+    assert len(events) > 0 and span[0] <= events.t_us.min() and events.t_us.max() < 60_000
+    part = run.events(start=20_000, end=60_000, sensor=SENSITIVE)
+    assert 0 < len(part) < len(events) and part.t_us.min() >= 20_000
+    times = np.arange(0, 100_001, 20_000)
+    poses = [capture.trajectory.pose(torch.tensor(t / span[1]), torch.tensor(0)) for t in times]
+    along = run.events((times.tolist(), poses), size=(12, 8), end=60_000, sensor=SENSITIVE)
+    assert (along.width, along.height) == (12, 8) and len(along) > 0
+
+
+def test_a_run_gives_its_gaussians_and_a_video_away(run: sf.Run, tmp_path: Path) -> None:
+    count = run.export(tmp_path / "scene.ply")
+    assert count == len(run.model.scene.gaussians)
+    assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply")
+    assert run.video(tmp_path / "images", images=2) == 2
+    assert len(list((tmp_path / "images").glob("*.png"))) == 2
+    with pytest.raises(sf.SharpfieldError, match="exported as .ply"):
+        run.export(tmp_path / "scene.obj")

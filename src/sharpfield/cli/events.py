@@ -15,8 +15,9 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.report.event_frames import windows
+from sharpfield.runs.events import RECORDED, event_sensor, whole_steps
 from sharpfield.runs.run import Run, open_run
-from sharpfield.simulation.sensors.event_pixels import SENSORS, SIZES, EventSensor
+from sharpfield.simulation.sensors.event_pixels import SIZES, EventSensor
 from sharpfield.storage.event_formats import expect_format
 from sharpfield.twin.match import match
 from sharpfield.twin.output import (
@@ -33,15 +34,12 @@ from sharpfield.twin.twin import (
     EventTwin,
     Pace,
     Viewpoint,
-    filter_of,
     light_of,
     on_path,
     on_track,
-    recorded_sensor,
     sized,
 )
 
-RECORDED = "recorded"
 OWN_SIZE = "sensor"
 PIECE_MS = 10.0
 """Events are written whenever so much time was seen, where no windows are asked for."""
@@ -149,7 +147,7 @@ def events(
     span = _switched_on(whole, seat, place, extra)
     recorded = _recorded(opened.capture, place, extra, seat)
     edges = windows(*seat.span_us, us(PIECE_MS if extra.frames is None else extra.frames))
-    sensor = _sensor(opened.capture, pixels)
+    sensor = event_sensor(opened.capture, pixels.sensor, pixels.threshold)
     if pixels.match:
         sensor = _matched(console, opened, pixels, seat.span_us, sensor)
     wanted = Wanted(
@@ -160,7 +158,7 @@ def events(
     )
     with telling(console, span) as (look, tell):
         light = light_of(opened.model, seat, subpixels=pixels.subpixels, progress=look)
-        seen = _whole_steps(span, whole.span_us[1], pixels.pace())
+        seen = whole_steps(span, whole.span_us[1], pixels.pace())
         twin = EventTwin(light, seen, sensor, pace=pixels.pace(), seed=pixels.seed)
         made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
     say = f"{made.count:,} events, from {twin.looks} images, are in {out}"
@@ -222,13 +220,6 @@ def _switched_on(
     return on, end
 
 
-def _whole_steps(span_us: tuple[int, int], last_us: int, pace: Pace) -> tuple[int, int]:
-    """The span with all of its last step, so that where it is cut changes nothing before."""
-    start, end = span_us
-    steps = -(-(end - start) // pace.step_us)
-    return start, min(start + steps * pace.step_us, last_us)
-
-
 def _matched(
     console: Console, opened: Run, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
 ) -> EventSensor:
@@ -257,21 +248,6 @@ def _size(size: str, sensor: str) -> tuple[int, int]:
             "this sensor has no size of its own", got=sensor, do=f"name one of {', '.join(SIZES)}"
         )
     return SIZES[sensor]
-
-
-def _sensor(capture: Capture, pixels: Pixels) -> EventSensor:
-    """The sensor of a name, behind the capture's colour filter."""
-    if pixels.sensor not in (RECORDED, *SENSORS):
-        raise OptionError(
-            "unknown sensor", got=pixels.sensor, do=f"use {RECORDED}, {', '.join(SENSORS)}"
-        )
-    if pixels.sensor == RECORDED:
-        sensor = recorded_sensor(capture)
-    else:
-        sensor = replace(SENSORS[pixels.sensor], bayer=filter_of(capture))
-    if pixels.threshold is None:
-        return sensor
-    return replace(sensor, threshold_on=pixels.threshold, threshold_off=pixels.threshold)
 
 
 def _recorded(

@@ -3,23 +3,38 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+import torch
+from jaxtyping import Float32, UInt8
 from rich.console import Console
+from rich.progress import track
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import RunError
+from sharpfield.core.device import device_of
+from sharpfield.core.errors import OptionError, RunError
+from sharpfield.core.events import EventStream
 from sharpfield.core.progress import progress_on
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
+from sharpfield.evaluation.paths import camera_path
 from sharpfield.evaluation.refine import Refinement, refine_poses
 from sharpfield.evaluation.report import RunDescription, write_report
+from sharpfield.fields.gaussians.export import export_splats
 from sharpfield.metrics.lpips import Lpips
+from sharpfield.recipes.splats.model import SplatModel
+from sharpfield.rendering.view import render_view, renderer_of
+from sharpfield.report.colormaps import eight_bit
+from sharpfield.report.video import write_video
 from sharpfield.runs.config import RunConfig, device_named, read_run_config, used
+from sharpfield.runs.events import RECORDED, event_sensor, render_events
+from sharpfield.runs.events import Path as EventPath
+from sharpfield.runs.events import viewpoint as event_viewpoint
 from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
+from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.record import Ledger, read_ledger
+from sharpfield.twin.twin import PACE, Pace
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,6 +115,120 @@ class Run:
         camera = viewpoint(self.model, self.capture, at, time)
         return depth_along_axis(self.model, self.capture, camera)
 
+    def events(
+        self,
+        path: int | EventPath = 0,
+        *,
+        start: float | int | None = None,
+        end: float | int | None = None,
+        size: tuple[int, int] | None = None,
+        sensor: str | EventSensor = RECORDED,
+        pace: Pace = PACE,
+        subpixels: int = 1,
+        seed: int = 0,
+    ) -> EventStream:
+        """The events that a camera would report in the scene.
+
+        Args:
+            path: Number of a camera track of the capture; or times in us and the poses then.
+            start: The camera is switched on then, in us; by default where its path begins.
+            end: Its last event is before; by default where its path ends.
+            size: Width and height of the sensor in px; by default the capture's.
+            sensor: "recorded" for ideal pixels with the thresholds that the capture states; ideal,
+                dvs346, gen3-vga, gen4-hd; or the numbers of one.
+            pace: How finely time is stepped.
+            subpixels: Along each side of a pixel, whose light is their mean.
+            seed: Random seed of what differs from pixel to pixel, and of noise.
+
+        Raises:
+            OptionError: There is no such track or sensor, or the path does not last from `start`
+                to `end`.
+        """
+        if isinstance(sensor, str):
+            sensor = event_sensor(self.capture, sensor)
+        camera = event_viewpoint(self.model, self.capture, path, size)
+        return render_events(
+            self.model, camera, sensor, (start, end), pace=pace, subpixels=subpixels, seed=seed
+        )
+
+    def export(
+        self,
+        path: Path | str,
+        *,
+        encoding: Literal["linear", "gamma2.2", "srgb"] | None = None,
+    ) -> int:
+        """Write the Gaussians as a .ply file for viewers of splats, in the capture's world.
+
+        Args:
+            path: The file, FILE.ply.
+            encoding: How the colours of the Gaussians relate to light; by default as the frames
+                say.
+
+        Returns:
+            How many Gaussians there are.
+
+        Raises:
+            OptionError: The run holds no Gaussians, or the file has another ending.
+        """
+        path, model = expect_splat_file(Path(path)), self.model
+        if not isinstance(model, SplatModel):
+            raise OptionError(
+                "this run holds no Gaussians",
+                where=self.folder,
+                got=f"the recipe {self.config.name}",
+                do="export a run of one of the splat recipes; `sharpfield recipes` lists them",
+            )
+        gaussians = model.scene.gaussians
+        antialiased = ("antialiased",) if model.scene.splatting.antialiased else ()
+        export_splats(
+            gaussians,
+            path,
+            encoding=encoding or model.encoding,
+            change=model.change.inverse(),
+            comments=(f"sharpfield {self.config.name}", *antialiased),
+        )
+        return len(gaussians)
+
+    def video(
+        self,
+        out: Path | str,
+        *,
+        path: str = "spiral",
+        images: int = 60,
+        fps: float | int = 30,
+        console: Console | None = None,
+    ) -> int:
+        """Render images along a camera path.
+
+        Args:
+            out: A video FILE.mp4, or a folder for PNG files.
+            path: spiral, train, or exposure:N for the inside of the exposure of frame N.
+            images: How many.
+            fps: Frames per second of the video.
+            console: Where progress is shown.
+
+        Returns:
+            How many images were written.
+
+        Raises:
+            OptionError: There is no such path.
+        """
+        model, console = self.model, console or Console()
+        moves = camera_path(self.seen, path, images=images)
+
+        def rendered(number: int) -> UInt8[np.ndarray, "h w c"]:
+            pose = torch.from_numpy(moves.poses[number]).to(device_of(model))
+            seen = render_view(
+                renderer_of(model), model.capture.camera, pose, float(moves.time[number])
+            )
+            with torch.no_grad():
+                return eight_bit(model.encode(seen.rgb.to(device_of(model))).cpu().numpy())
+
+        numbers = track(
+            range(len(moves)), "rendering", console=console, disable=not console.is_terminal
+        )
+        return write_video(Path(out), (rendered(number) for number in numbers), rate=float(fps))
+
     def evaluate(
         self,
         *,
@@ -169,6 +298,17 @@ def open_run(folder: Path | str, *, capture: Path | str | None = None, device: s
     model = recipe.build(used(whole, config.use), config.seed)
     restore_weights(load(file_of(folder, "last")), model)
     return Run(folder, config, model.to(device_named(device)), whole)
+
+
+def expect_splat_file(path: Path) -> Path:
+    """The path itself, if Gaussians can be exported to it.
+
+    Raises:
+        OptionError: It has another ending than .ply.
+    """
+    if path.suffix != ".ply":
+        raise OptionError("splats are exported as .ply", got=path, do="name a file FILE.ply")
+    return path
 
 
 def _needed_ledger(folder: Path) -> Ledger:
