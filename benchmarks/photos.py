@@ -14,7 +14,7 @@ from rich.console import Console
 
 from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.captures.summary import downscaled
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/photos"))
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    capture = downscaled(read(asked.scene), asked.shrink)
+    capture = downscaled(read_capture(asked.scene), asked.shrink)
     folder = asked.out / "capture"
     native.write(capture, folder)
     rows: list[Row] = []

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure
@@ -86,7 +86,9 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     asked = parser.parse_args()
     capture = (
-        read(asked.capture) if asked.capture else simulated(asked.size, asked.sensor, asked.seed)
+        read_capture(asked.capture)
+        if asked.capture
+        else simulated(asked.size, asked.sensor, asked.seed)
     )
     out = asked.out / capture.name
     folders = {"stored": out / "capture", "sharp": out / "capture-sharp"}

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.choose import prepared
@@ -94,7 +94,7 @@ def main() -> None:
         rig = replace(ROOM_RIG, size=parse_size(asked.size))
         timing = replace(RoomTiming(), frames=asked.frames)
         native.write(simulate_room(rig=rig, timing=timing, seed=asked.seed), source)
-    capture, rows = read(source), []
+    capture, rows = read_capture(source), []
     budget = f"{asked.steps} steps" if asked.steps else f"{asked.minutes:g} minutes"
     for number, contender in enumerate(STUDIES[asked.study]):
         rows.append(_compete(contender, capture, source, out / f"{number}", asked))

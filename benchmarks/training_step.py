@@ -26,7 +26,7 @@ from torch.optim import Adam, Optimizer
 
 from benchmarks.plain import Plain
 from benchmarks.table import Row, save, show
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
 from sharpfield.simulation.simulate import Rig, simulate
@@ -80,7 +80,7 @@ class Measured:
 
 def captured(folder: Path) -> Capture:
     """The capture in a folder, or a simulated one of the same size if there is none."""
-    return read(folder) if folder.exists() else simulate(rig=Rig((300, 200)))
+    return read_capture(folder) if folder.exists() else simulate(rig=Rig((300, 200)))
 
 
 def recipe_for(contender: Contender, parts: int) -> EvDeblurNeRF:

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from sharpfield.captures.read import read as read_capture
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur_to
@@ -44,6 +44,8 @@ def read(
     encoding: str | None = None,
     hold_out: str | None = None,
     threshold: float | None = None,
+    factor: int | None = None,
+    bounds: tuple[float, float] | None = None,
     trust_pickle: bool = False,
     poses: bool = True,
 ) -> Capture:
@@ -61,6 +63,8 @@ def read(
             says.
         threshold: Contrast threshold of the events for both signs, natural log, where it is known
             better.
+        factor: Read the images in `images_<factor>`; by default the smallest images there are.
+        bounds: Nearest and farthest depth of the scene, in world units.
         trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
             are built from them, and anything else is refused.
         poses: Whether its poses must be known; `deblur` needs none.
@@ -69,25 +73,18 @@ def read(
         CaptureError: The capture cannot be read, or its poses are not known yet.
         OptionError: An option does not fit the layout.
     """
-    if not poses:
-        return read_unposed(
-            path,
-            layout=layout,
-            event_unit=event_unit,
-            missing=missing,
-            threshold=threshold,
-            trust_pickle=trust_pickle,
-        )
-    return read_capture(
-        path,
+    options = ReadOptions(
         layout=layout,
         event_unit=event_unit,
         missing=missing,
         encoding=encoding,
         hold_out=hold_out,
         threshold=threshold,
+        factor=factor,
+        bounds=bounds,
         trust_pickle=trust_pickle,
     )
+    return read_capture(path, options, poses=poses)
 
 
 def simulate(

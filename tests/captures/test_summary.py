@@ -5,6 +5,7 @@ import h5py
 import numpy as np
 import pytest
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.native.layout import write
 from sharpfield.captures.summary import capture_summary, summary
 from sharpfield.captures.writers import llff_events as write_llff_events
@@ -85,7 +86,7 @@ def test_a_file_that_does_not_state_its_unit(tmp_path, some_events, name):
     assert (about["t_first"], about["t_last"]) == tuple(events.t_us[[0, -1]] * 1_000)
     assert (about["width"], about["height"]) == (12, 10)
     assert about["size_from"] == "largest coordinates"
-    told = summary(tmp_path / name, event_unit="ns")["events"]
+    told = summary(tmp_path / name, ReadOptions(event_unit="ns"))["events"]
     assert told["t_last_us"] == events.t_us[-1]
 
 

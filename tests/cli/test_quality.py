@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.main import main
 
 
@@ -14,7 +14,7 @@ def run(*words: str) -> None:
 def test_a_room_is_walked_through_and_judged(tmp_path, capsys):
     room = tmp_path / "room"
     run("simulate", "--out", room, "--scene", "room", "--frames", "9", "--size", "48x36")
-    capture = read(room)
+    capture = read_capture(room)
     assert capture.depth is not None and len(capture.frames) == 9 and capture.events is None
     capsys.readouterr()
     run("quality", room, "--json", "--out", tmp_path / "judged")
@@ -32,7 +32,7 @@ def test_a_room_in_the_layout_of_scannet(tmp_path):
     room = tmp_path / "room"
     words = ("--frames", "7", "--size", "32x24", "--blurry", "1", "--layout", "scannet")
     run("simulate", "--out", room, "--scene", "room", *words)
-    capture = read(room)
+    capture = read_capture(room)
     assert capture.source == "scannet" and capture.frames.encoding == "srgb"
     np.testing.assert_array_equal(capture.split.train, [0, 5])
     assert (capture.frames.blur_px > 0).tolist() == [True, *[False] * 4, True, False]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sharpfield.captures.native.layout import write
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.fields.gaussians.export import import_splats
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.view import render_view
@@ -45,7 +45,7 @@ def test_evaluate_measures_a_run_of_gaussians(trained: Path) -> None:
 def test_a_camera_that_reported_nothing_is_as_none(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    capture = read(recorded)
+    capture = read_capture(recorded)
     write(replace(capture, events=capture.needed_events[:0]), tmp_path / "silent")
     words = ("--out", tmp_path / "run", *SMALL)
     assert run("train", "event-splat", tmp_path / "silent", *words) == 2

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.native.layout import write
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.captures.writers import evdnerf as write_evdnerf
 from sharpfield.events.index import build, signed_sum
 from sharpfield.simulation.cameras.rigs import RING_FOCAL, ring
@@ -65,7 +65,7 @@ def test_reversed_time_turns_the_signs(capture):
 def test_both_layouts_hold_the_same_rig(capture, tmp_path):
     write(capture, tmp_path / "native")
     write_evdnerf.write(capture, tmp_path / "evdnerf")
-    ours, theirs = read(tmp_path / "native"), read(tmp_path / "evdnerf")
+    ours, theirs = read_capture(tmp_path / "native"), read_capture(tmp_path / "evdnerf")
     np.testing.assert_allclose(theirs.trajectory.poses, ours.trajectory.poses, atol=1e-9)
     np.testing.assert_array_equal(theirs.needed_frames.images, ours.needed_frames.images)
     np.testing.assert_array_equal(theirs.needed_frames.track, ours.needed_frames.track)

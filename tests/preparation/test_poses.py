@@ -11,7 +11,7 @@ import torch
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_layouts import OuterPath
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.poses import Elsewhere
 from sharpfield.cli.poses import poses as poses_command
 from sharpfield.core.capture import Capture
@@ -97,7 +97,7 @@ def test_scale_bounds_and_points_go_together() -> None:
 
 def test_the_capture_survives_the_disk_and_the_report_says_what_happened(tmp_path: Path) -> None:
     native.write(found().capture, tmp_path / "posed")
-    again = read(tmp_path / "posed")
+    again = read_capture(tmp_path / "posed")
     np.testing.assert_array_equal(again.points, found().capture.points)
     about = summary(unposed(fast()), found())
     assert json.loads(json.dumps(about))["registered"] == 21
@@ -125,7 +125,7 @@ def test_the_real_blurry_scene_registers(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     if not BLURBALL.is_dir():
         pytest.skip("posed/deblurnerf_blurball is not in ../shared/data")
-    scene = read(BLURBALL)
+    scene = read_capture(BLURBALL)
     made = find_poses(scene, PoseOptions()).capture
     assert len(made.needed_frames) >= 26
     rows = [scene.needed_frames.names.index(name) for name in made.needed_frames.names]
@@ -230,5 +230,5 @@ def test_command_attaches_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[s
         elsewhere=Elsewhere(trajectory=tmp_path / "path.npz", bounds=(2.0, 8.0)),
     )
     assert "7 of 7 frames" in capsys.readouterr().out
-    assert read(tmp_path / "posed").near == 2.0
+    assert read_capture(tmp_path / "posed").near == 2.0
     assert json.loads((tmp_path / "posed" / "poses.json").read_text())["poses_from"] == "npz"

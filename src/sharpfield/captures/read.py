@@ -1,99 +1,77 @@
-"""Look at a path, recognise its layout, and read it. A new layout is one line in `LAYOUTS`."""
+"""Read a capture: recognise the layout of a folder, read it, and apply the options of the user."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.layouts import (
-    arkitscenes,
-    colmap,
-    d_nerf,
-    deblur_nerf,
-    evdnerf,
-    event_nerf,
-    llff_events,
-    nerf_synthetic,
-    nerfstudio,
-    robust_e_nerf,
-    scannet,
-    sens_file,
-    seven_scenes,
-)
-from sharpfield.captures.layouts._photos import Missing
-from sharpfield.captures.native import layout as native
+from sharpfield.captures.layout import FOR_ALL, NO_OPTIONS, Layout, ReadOptions
+from sharpfield.captures.native.layout import expect_poses
 from sharpfield.core.capture import Capture, Thresholds
-from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
+from sharpfield.core.plugins import Registry
+
+_ROOM = "sharpfield.captures"
+LAYOUTS = Registry(
+    "sharpfield.layouts",
+    {
+        "native": f"{_ROOM}.native.layout:LAYOUT",
+        "ev-deblur-nerf": f"{_ROOM}.layouts.llff_events:LAYOUT",
+        "deblur-nerf": f"{_ROOM}.layouts.deblur_nerf:LAYOUT",
+        "evdnerf": f"{_ROOM}.layouts.evdnerf:LAYOUT",
+        "event-nerf": f"{_ROOM}.layouts.event_nerf:LAYOUT",
+        "robust-e-nerf": f"{_ROOM}.layouts.robust_e_nerf:LAYOUT",
+        "scannet": f"{_ROOM}.layouts.scannet:LAYOUT",
+        "sens": f"{_ROOM}.layouts.sens_file:LAYOUT",
+        "arkitscenes": f"{_ROOM}.layouts.arkitscenes:LAYOUT",
+        "7-scenes": f"{_ROOM}.layouts.seven_scenes:LAYOUT",
+        "d-nerf": f"{_ROOM}.layouts.d_nerf:LAYOUT",
+        "nerf-synthetic": f"{_ROOM}.layouts.nerf_synthetic:LAYOUT",
+        "nerfstudio": f"{_ROOM}.layouts.nerfstudio:LAYOUT",
+        "colmap": f"{_ROOM}.layouts.colmap:LAYOUT",
+    },
+)
+"""Every layout by name; the first that recognises a folder reads it."""
 
 
-@dataclass(frozen=True)
-class Layout:
-    """A way to lay a capture out on disk."""
+def read_capture(
+    folder: Path | str, options: ReadOptions = NO_OPTIONS, *, poses: bool = True
+) -> Capture:
+    """Read a capture.
 
-    recognise: Callable[[Path], bool]
-    """Whether a folder has this layout, judged by its files without loading them."""
-    read: Callable[..., Capture]
-    """Takes the folder, and the options below."""
-    marks: str
-    """The files it is recognised by, for the message when nothing is."""
-    options: tuple[str, ...] = ()
-    """Options of `read` that only some layouts have."""
+    Args:
+        folder: The folder that holds the images or events.
+        options: How to read it, where its layout is wrong or silent.
+        poses: Whether the poses must be known; what comes before training needs none.
+
+    Raises:
+        CaptureError: The capture cannot be read, or its poses are unknown and `poses` is set.
+        OptionError: An option does not fit the layout.
+    """
+    folder = Path(folder)
+    layout = layout_named(options.layout or layout_of(folder))
+    for name in options.given().keys() - {*FOR_ALL, *layout.options}:
+        others = [known for known, one in LAYOUTS.working().items() if name in one.options]
+        raise OptionError(
+            f"the layout {layout.name} has no option {name}",
+            where=folder,
+            do=f"it belongs to {', '.join(others)}",
+        )
+    capture = layout.read(folder, options)
+    if poses:
+        expect_poses(capture, folder)
+    return _with_options(capture, options)
 
 
-LAYOUTS: dict[str, Layout] = {
-    "native": Layout(native.recognise, native.read_unposed, "capture.toml"),
-    "ev-deblur-nerf": Layout(
-        llff_events.recognise,
-        llff_events.read,
-        "poses_bounds.npy, all_poses_bounds.npy and events.h5",
-        options=("event_unit",),
-    ),
-    "deblur-nerf": Layout(deblur_nerf.recognise, deblur_nerf.read, "poses_bounds.npy and images*/"),
-    "evdnerf": Layout(
-        evdnerf.recognise,
-        evdnerf.read,
-        "transforms_train.json and data_frames_train.npy",
-        options=("trust_pickle", "threshold"),
-    ),
-    "event-nerf": Layout(
-        event_nerf.recognise,
-        event_nerf.read,
-        "train/pose/, train/intrinsics/ and train/events/*.npz",
-        options=("event_unit",),
-    ),
-    "robust-e-nerf": Layout(
-        robust_e_nerf.recognise,
-        robust_e_nerf.read,
-        "raw_events.npz, camera_poses.npz and camera_calibration.npz",
-    ),
-    "scannet": Layout(
-        scannet.recognise, scannet.read, "color/, pose/ and intrinsic/intrinsic_color.txt"
-    ),
-    "sens": Layout(sens_file.recognise, sens_file.read, "one .sens file"),
-    "arkitscenes": Layout(
-        arkitscenes.recognise, arkitscenes.read, "lowres_wide/ and lowres_wide.traj"
-    ),
-    "7-scenes": Layout(seven_scenes.recognise, seven_scenes.read, "frame-*.color.png"),
-    "d-nerf": Layout(
-        d_nerf.recognise,
-        d_nerf.read,
-        "transforms_train.json with a `time` in each frame",
-        options=("missing",),
-    ),
-    "nerf-synthetic": Layout(
-        nerf_synthetic.recognise,
-        nerf_synthetic.read,
-        "transforms_train.json",
-        options=("missing",),
-    ),
-    "nerfstudio": Layout(
-        nerfstudio.recognise, nerfstudio.read, "transforms.json", options=("missing",)
-    ),
-    "colmap": Layout(
-        colmap.recognise, colmap.read, "sparse/0/cameras.bin and images*/", options=("missing",)
-    ),
-}
-"""Every layout that can be read, by name; the first that recognises a folder reads it."""
+def layout_named(name: str) -> Layout:
+    """A layout by its name.
+
+    Raises:
+        OptionError: There is none of this name.
+    """
+    layout = LAYOUTS.get(name)
+    if layout is None:
+        raise OptionError("unknown layout", got=name, do=did_you_mean(name, LAYOUTS))
+    return layout
 
 
 def layout_of(folder: Path) -> str:
@@ -108,99 +86,30 @@ def layout_of(folder: Path) -> str:
             where=folder,
             do="give the folder that holds the images or events",
         )
-    for name, layout in LAYOUTS.items():
+    layouts: dict[str, Layout] = LAYOUTS.working()
+    for name, layout in layouts.items():
         if layout.recognise(folder):
             return name
     raise CaptureError(
-        "no known layout",
+        "unknown layout of a capture",
         where=folder,
         got=", ".join(sorted(entry.name for entry in folder.iterdir())[:8]) or "an empty folder",
-        do="it must hold " + "; or ".join(f"{x.marks} ({name})" for name, x in LAYOUTS.items()),
+        do="it must hold " + "; or ".join(f"{x.marks} ({name})" for name, x in layouts.items()),
     )
 
 
-def read(
-    folder: Path | str,
-    *,
-    layout: str | None = None,
-    event_unit: str | None = None,
-    missing: Missing | None = None,
-    encoding: str | None = None,
-    hold_out: str | None = None,
-    threshold: float | None = None,
-    trust_pickle: bool = False,
-) -> Capture:
-    """Read a capture.
-
-    Args:
-        folder: The capture.
-        layout: One of `LAYOUTS`; by default it is recognised.
-        event_unit: Unit of the event times (ns, us, ms, s), where it is not what the layout has.
-        missing: Whether images that are named but not there are an "error" or to "skip".
-        encoding: How stored values relate to light (see `Frames`), where the layout is wrong.
-        hold_out: Frames to hold out: `every:8`, `train:5`, `last:5` or `none`; by default as the
-            layout says.
-        threshold: Contrast threshold of the events for both signs, where it is known better.
-        trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
-            are built from them, and anything else is refused.
-
-    Raises:
-        CaptureError: The capture cannot be read, or nobody knows its poses yet.
-        OptionError: An option does not fit the layout.
-    """
-    capture = read_unposed(
-        folder,
-        layout=layout,
-        event_unit=event_unit,
-        missing=missing,
-        threshold=threshold,
-        trust_pickle=trust_pickle,
-    )
-    native.expect_poses(capture, folder)
-    if encoding is not None:
-        capture = replace(capture, frames=replace(capture.needed_frames, encoding=encoding))
-    if hold_out is not None:
-        capture = replace(capture, split=split_by_rule(len(capture.needed_frames), hold_out))
-    return capture
-
-
-def read_unposed(
-    folder: Path | str,
-    *,
-    layout: str | None = None,
-    event_unit: str | None = None,
-    missing: Missing | None = None,
-    threshold: float | None = None,
-    trust_pickle: bool = False,
-) -> Capture:
-    """Read a capture, whether its poses are known or not; see `native.read_unposed`.
-
-    The options are those of `read`.
-
-    Raises:
-        CaptureError: The capture cannot be read.
-        OptionError: An option does not fit the layout.
-    """
-    folder = Path(folder)
-    name = layout or layout_of(folder)
-    if name not in LAYOUTS:
-        raise OptionError("unknown layout", got=name, do=f"use one of {', '.join(LAYOUTS)}")
-    options = {
-        "event_unit": event_unit,
-        "missing": missing,
-        "trust_pickle": trust_pickle or None,
-        "threshold": threshold if "threshold" in LAYOUTS[name].options else None,
-    }
-    given = {option: value for option, value in options.items() if value is not None}
-    for option in given.keys() - set(LAYOUTS[name].options):
-        able = [other for other in LAYOUTS if option in LAYOUTS[other].options]
-        raise OptionError(
-            f"the layout {name} has no option {option}",
-            where=folder,
-            do=f"it belongs to {', '.join(able)}",
-        )
-    capture = LAYOUTS[name].read(folder, **given)
-    if threshold is not None:
-        known = replace(capture.known, thresholds=Thresholds(threshold, threshold))
-        capture = replace(capture, known=known)
-    return capture
+def _with_options(capture: Capture, options: ReadOptions) -> Capture:
+    """The capture with what the user says instead of its layout."""
+    known = capture.known
+    if options.encoding is not None:
+        frames = replace(capture.needed_frames, encoding=options.encoding)
+        capture = replace(capture, frames=frames)
+    if options.hold_out is not None:
+        split = split_by_rule(len(capture.needed_frames), options.hold_out)
+        capture = replace(capture, split=split)
+    if options.threshold is not None:
+        known = replace(known, thresholds=Thresholds(options.threshold, options.threshold))
+    if options.bounds is not None:
+        known = replace(known, bounds="known")
+        capture = replace(capture, near=options.bounds[0], far=options.bounds[1])
+    return replace(capture, known=known)

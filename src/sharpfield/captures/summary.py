@@ -15,9 +15,10 @@ import numpy as np
 import torch
 from jaxtyping import Shaped
 
+from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.captures.layouts import llff_events
 from sharpfield.captures.native.known import known_table
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
@@ -36,30 +37,22 @@ PATH_SAMPLES = 1000
 EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
 
 
-def summary(
-    path: Path | str,
-    *,
-    event_unit: str | None = None,
-    layout: str | None = None,
-    trust_pickle: bool = False,
-) -> dict[str, Any]:
+def summary(path: Path | str, options: ReadOptions = NO_OPTIONS) -> dict[str, Any]:
     """What is at a path: a capture's folder, or a single file of events.
 
     Args:
         path: The folder or file.
-        event_unit: Unit of the event times (ns, us, ms, s), where the file does not say.
-        layout: Of the capture; by default it is recognised.
-        trust_pickle: Open pickled files, see `read`.
+        options: How to read it; of a single file of events, `event_unit`.
 
     Raises:
         CaptureError: It cannot be read.
     """
     path = Path(path)
     if path.is_file() and path.suffix in EVENT_SUFFIXES:
-        with open_events(path, unit=event_unit) as file:
+        with open_events(path, unit=options.event_unit) as file:
             told = file if file.unit else replace(file, unit=_unit_of_layout(path))
             return {"kind": "events", "name": path.name, "events": file_summary(told)}
-    capture = read_unposed(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
+    capture = read_capture(path, options, poses=False)
     return capture_summary(capture)
 
 

@@ -10,17 +10,17 @@ from typing import Any
 from tyro.conf import Positional
 
 from sharpfield.captures.blocks import blocks_of
-from sharpfield.captures.read import read
+from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
-from sharpfield.cli.runs import OPTIONS, READING, Choice
+from sharpfield.cli.runs import OPTIONS, Choice
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.options import changed, with_options
 from sharpfield.recipes.splats.merge import merge
 from sharpfield.runs.config import (
-    ReadOptions,
     RunConfig,
     device_named,
     read_run_config,
@@ -55,7 +55,7 @@ def blocks(
     device: Device = "auto",
     choice: Cut = CUT,
     options: Options = OPTIONS,
-    reading: ReadOptions = READING,
+    reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Train a long capture in overlapping blocks, and merge them into one run.
@@ -71,19 +71,17 @@ def blocks(
         device: Where to train.
         choice: Presets, streams, single numbers, blocks.
         options: How long, how often to save, how much memory; for each block.
-        reading: What to believe instead of the capture's layout.
+        reading: How to read the capture, where its layout is wrong or silent.
         numbers: Options of the recipe by name, such as sampling.views.
     """
     if choice.block:
         raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
     hint_at_flags(recipe, choice.change)
     console, where, count = screen(), device_named(device), choice.count
-    source = read(capture, **reading.given())
+    source = read_capture(capture, reading)
     made = prepared(recipe, choice.preset, capture=source, device=where)
     made = with_options(changed(made, choice.change), numbers)
-    whole = RunConfig(
-        recipe, made, str(capture.resolve()), choice.seed, choice.use, reading.given()
-    )
+    whole = RunConfig(recipe, made, str(capture.resolve()), choice.seed, choice.use, reading)
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
     started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
     for run, block in zip(runs, started, strict=True):

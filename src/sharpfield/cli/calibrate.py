@@ -6,7 +6,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
 from sharpfield.core.capture import Thresholds
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions
@@ -30,7 +30,7 @@ def calibrate(
         write_capture: Also write the capture, with the thresholds found, to this folder.
         options: How much to look at.
     """
-    held = read_unposed(capture)
+    held = read_capture(capture, poses=False)
     made = measure(held, options)
     about = write_calibration(held, made, out)
     console = screen()

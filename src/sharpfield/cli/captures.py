@@ -7,8 +7,9 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.read import read_capture
 from sharpfield.captures.summary import summary
 from sharpfield.cli.arguments import Size, parse_size, screen
 from sharpfield.core.capture import Capture
@@ -108,7 +109,8 @@ def inspect(
         trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
             are built from them, and anything else is refused.
     """
-    found = summary(path, layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
+    options = ReadOptions(layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
+    found = summary(path, options)
     print(_as_json(found) if json else as_text(found))
 
 
@@ -126,7 +128,7 @@ def deblur(
         layout: Of the capture, if it is not recognised.
         options: Method, instants.
     """
-    deblur_to(read_unposed(capture, layout=layout), out, options)
+    deblur_to(read_capture(capture, ReadOptions(layout=layout), poses=False), out, options)
     screen().print(f"Sharp frames are in {out}")
 
 

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_layouts import OuterPath, PathLayout, read_hand_eye, read_path
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -71,7 +71,7 @@ def poses(
         elsewhere: Poses from a file.
     """
     expect_replaceable(out, native.recognise)
-    original, mount = read_unposed(capture), elsewhere.mount()
+    original, mount = read_capture(capture, poses=False), elsewhere.mount()
     if elsewhere.trajectory is not None:
         path = read_path(elsewhere.trajectory, elsewhere.layout)
         _attach(original, path, mount, elsewhere.bounds, out)

@@ -6,7 +6,8 @@ from pathlib import Path
 from rich.table import Table
 from tyro.conf import Positional
 
-from sharpfield.captures.read import read
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
 from sharpfield.preparation.quality import (
     QualityOptions,
@@ -38,7 +39,7 @@ def quality(
         layout: Of the capture, if it is not recognised.
         options: How frames are judged.
     """
-    held = read(capture, layout=layout)
+    held = read_capture(capture, ReadOptions(layout=layout))
     found, told_by = judged(held, options)
     about = as_table(held, found, told_by)
     if out is not None:

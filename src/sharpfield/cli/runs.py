@@ -12,7 +12,8 @@ import tyro
 from rich.progress import track
 from tyro.conf import Positional
 
-from sharpfield.captures.read import read
+from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.evaluation.paths import camera_path
@@ -22,7 +23,7 @@ from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.options import changed, with_options
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.video import write_video
-from sharpfield.runs.config import ReadOptions, RunConfig, device_named
+from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.training.plan import Options
@@ -47,7 +48,7 @@ class Choice:
     """Options of the recipe, as events.weight=0; better written --events.weight 0."""
 
 
-CHOICE, OPTIONS, READING, REFINEMENT = Choice(), Options(), ReadOptions(), Refinement()
+CHOICE, OPTIONS, REFINEMENT = Choice(), Options(), Refinement()
 
 
 def train(
@@ -57,7 +58,7 @@ def train(
     device: Device = "auto",
     choice: Choice = CHOICE,
     options: Options = OPTIONS,
-    reading: ReadOptions = READING,
+    reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Train a recipe on a capture.
@@ -69,16 +70,16 @@ def train(
         device: Where to train.
         choice: Presets, streams, single numbers.
         options: How long, how often to save, how much memory.
-        reading: What to believe instead of the capture's layout.
+        reading: How to read the capture, where its layout is wrong or silent.
         numbers: Options of the recipe by name, such as sampling.views.
     """
     hint_at_flags(recipe, choice.change)
     console, where = screen(), device_named(device)
-    source = read(capture, **reading.given())
+    source = read_capture(capture, reading)
     made = prepared(recipe, choice.preset, capture=source, device=where)
     made = with_options(changed(made, choice.change), numbers)
-    where_from, given = str(capture.resolve()), reading.given()
-    started = RunConfig(recipe, made, where_from, choice.seed, choice.use, given, choice.block)
+    where_from = str(capture.resolve())
+    started = RunConfig(recipe, made, where_from, choice.seed, choice.use, reading, choice.block)
     trained = start(started, source, out, options, device=where, console=console)
     if trained.ledger.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")

@@ -7,14 +7,15 @@ import dataclasses
 import json
 import types
 import typing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
 from sharpfield.captures.blocks import blocks_of, limited, parsed
-from sharpfield.captures.read import read
+from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.files import write_json
@@ -25,31 +26,6 @@ STREAMS = ("frames", "events")
 
 OWN_CAPTURE = "capture"
 """Folder within a run that holds the capture it was trained on, if that existed only in memory."""
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """How to read a capture, where its layout is wrong or silent."""
-
-    layout: str | None = None
-    """By default it is recognised."""
-    event_unit: str | None = None
-    """Unit of event times: ns, us, ms or s."""
-    missing: Literal["error", "skip"] | None = None
-    """What to do about images that are named but not there."""
-    encoding: str | None = None
-    """How stored values relate to light: linear, gamma2.2 or srgb."""
-    hold_out: str | None = None
-    """Frames to hold out: every:8, train:5, last:5 or none."""
-    threshold: float | None = None
-    """Contrast threshold of both signs."""
-    trust_pickle: bool = False
-    """Open pickled files, which may name programs to run; only arrays of numbers are built from
-    them, and anything else is refused."""
-
-    def given(self) -> dict[str, Any]:
-        """What was not left open."""
-        return {name: value for name, value in vars(self).items() if value not in (None, False)}
 
 
 @dataclass(frozen=True)
@@ -65,8 +41,8 @@ class RunConfig:
     seed: int
     use: tuple[str, ...] = STREAMS
     """Which streams of the capture are used."""
-    reading: dict[str, Any] = field(default_factory=dict)
-    """Options of `captures.read` that the capture was read with."""
+    reading: ReadOptions = NO_OPTIONS
+    """How the capture was read."""
     block: str = ""
     """Which block of a long capture it is trained on, "2/4"; "" for all of it."""
 
@@ -77,7 +53,7 @@ class RunConfig:
             "capture": self.capture,
             "seed": self.seed,
             "use": list(self.use),
-            "reading": self.reading,
+            "reading": self.reading.given(),
             **({"block": self.block} if self.block else {}),
             "options": dataclasses.asdict(self.recipe),
         }
@@ -100,7 +76,7 @@ class RunConfig:
                 got=source,
                 do="say where it is now: --capture FOLDER, or open_run(..., capture=FOLDER)",
             )
-        return block_of(read(source, **self.reading), self.block)
+        return block_of(read_capture(source, self.reading), self.block)
 
 
 def write_run_config(run: Path, config: RunConfig) -> None:
@@ -124,7 +100,7 @@ def read_run_config(run: Path) -> RunConfig:
             table["capture"],
             int(table["seed"]),
             tuple(table["use"]),
-            dict(table.get("reading", {})),
+            from_table(ReadOptions, table.get("reading", {})),
             table.get("block", ""),
         )
     except (FileNotFoundError, NotADirectoryError):

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts._rgbd import resized, usable_poses
-from sharpfield.captures.read import layout_of, read
+from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.captures.writers import scannet as write_scannet
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
@@ -63,7 +64,7 @@ def exported(folder, poses, colours, depths):
 def test_scannet(tmp_path, poses, colours, depths, inner):
     exported(tmp_path / inner, poses, colours, depths)
     assert layout_of(tmp_path) == "scannet"
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     np.testing.assert_array_equal(made.depth.stored, depths)
     np.testing.assert_allclose(made.frames.images.astype(int), colours, atol=2)
     np.testing.assert_allclose(made.frame_pose(np.arange(COUNT)), poses[:, :3], atol=1e-6)
@@ -79,7 +80,7 @@ def test_frames_without_a_pose_are_dropped_and_named(tmp_path, poses, colours, d
     poses[7, 0, 3] = np.nan
     poses[9, 1, 3] = 1e4
     exported(tmp_path, poses, colours, depths)
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     assert made.notes["dropped"] == "3 of 12 frames have no usable pose: 3, 7, 9"
     assert made.frames.names == tuple("0 1 2 4 5 6 8 10 11".split())
     np.testing.assert_array_equal(made.depth.stored, depths[[0, 1, 2, 4, 5, 6, 8, 10, 11]])
@@ -93,7 +94,7 @@ def test_frames_without_depth_or_pose_files(tmp_path, poses, colours, depths):
     (tmp_path / "depth" / "4.png").unlink()
     (tmp_path / "pose" / "6.txt").unlink()
     (tmp_path / "color" / "Thumbs.db").write_bytes(b"x")
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     assert made.notes["dropped"] == "1 of 12 frames have no usable pose: 6"
     assert made.notes["without_depth"] == "2 of 12 frames have no depth: 0, 4"
     kept = np.delete(np.arange(COUNT), 6)
@@ -101,7 +102,7 @@ def test_frames_without_depth_or_pose_files(tmp_path, poses, colours, depths):
     np.testing.assert_array_equal(made.depth.stored, depths[kept])
     for file in (tmp_path / "depth").glob("*.png"):
         file.unlink()
-    assert read(tmp_path).depth is None
+    assert read_capture(tmp_path).depth is None
 
 
 def test_intrinsics_of_another_size_are_refused(tmp_path, poses, colours, depths):
@@ -110,13 +111,13 @@ def test_intrinsics_of_another_size_are_refused(tmp_path, poses, colours, depths
     matrix[:2, 2] = 648, 484
     np.savetxt(tmp_path / "intrinsic" / "intrinsic_color.txt", matrix)
     with pytest.raises(CaptureError, match="the intrinsics are not those of the images"):
-        read(tmp_path)
+        read_capture(tmp_path)
 
 
 def test_no_pose_at_all_is_an_error(tmp_path, poses, colours, depths):
     exported(tmp_path, np.full_like(poses, -np.inf), colours, depths)
     with pytest.raises(CaptureError, match="no frame has a usable pose"):
-        read(tmp_path)
+        read_capture(tmp_path)
 
 
 def test_large_colour_is_brought_to_the_published_size():
@@ -159,7 +160,7 @@ def with_depth(panning: Capture) -> Capture:
 def test_what_is_written_for_scannet_is_read_again(panning, tmp_path):
     capture = with_depth(panning)
     write_scannet.write(capture, tmp_path / "scene")
-    made = read(tmp_path / "scene", encoding="gamma2.2")
+    made = read_capture(tmp_path / "scene", ReadOptions(encoding="gamma2.2"))
     np.testing.assert_array_equal(made.depth.stored, capture.depth.stored)
     np.testing.assert_allclose(
         made.frame_pose(np.arange(9)), capture.frame_pose(np.arange(9)), atol=1e-6
@@ -201,7 +202,7 @@ def test_sens(tmp_path, poses, colours, depths):
     poses[2] = -np.inf
     sens(tmp_path / "scene.sens", poses, colours, depths)
     assert layout_of(tmp_path) == "sens"
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     kept = np.delete(np.arange(COUNT), 2)
     np.testing.assert_array_equal(made.depth.stored, depths[kept])
     np.testing.assert_allclose(made.frames.images.astype(int), colours[kept], atol=2)
@@ -216,7 +217,7 @@ def test_sens(tmp_path, poses, colours, depths):
 def test_broken_sens_files(tmp_path, poses, colours, depths, damage, message):
     sens(tmp_path / "scene.sens", poses, colours, depths, **damage)
     with pytest.raises(CaptureError, match=message):
-        read(tmp_path)
+        read_capture(tmp_path)
 
 
 def test_7_scenes(tmp_path, poses, colours, depths):
@@ -227,13 +228,13 @@ def test_7_scenes(tmp_path, poses, colours, depths):
         write_image(place / f"{stem}.color.png", colours[i])
         write_image(place / f"{stem}.depth.png", depths[i].repeat(2, 0).repeat(2, 1)[..., None])
         np.savetxt(place / f"{stem}.pose.txt", poses[i])
-    one = read(tmp_path / "seq-01")
+    one = read_capture(tmp_path / "seq-01")
     assert one.source == "7-scenes" and one.frames.names == ("000000", "000001", "000002", "000003")
     assert one.camera.fx_px == 585 / 10 and one.depth.at(0)[0, 0] == 0
     np.testing.assert_array_equal(one.frames.images, colours[::3])
     (tmp_path / "TrainSplit.txt").write_text("sequence1\nsequence3\n")
     (tmp_path / "TestSplit.txt").write_text("sequence2\n")
-    scene = read(tmp_path)
+    scene = read_capture(tmp_path)
     assert [scene.frames.names[i][:6] for i in scene.split.test] == ["seq-02"] * 4
     assert len(scene.split.train) == 8
 
@@ -256,7 +257,7 @@ def test_arkitscenes(tmp_path, poses, colours, depths):
             f"64 48 {focal} {focal} 32.5 23.5\n"
         )
     np.savetxt(tmp_path / "lowres_wide.traj", lines)
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     assert made.source == "arkitscenes" and len(made.frames) == COUNT - 1
     assert made.notes["dropped"].startswith("1 of 12 frames have no usable pose: 40776204_101.150")
     found = made.frame_pose(np.arange(COUNT - 1)).double().numpy()
@@ -283,7 +284,7 @@ def test_arkitscenes_with_depth_at_half_the_rate(tmp_path, poses, colours, depth
             (tmp_path / "lowres_wide_intrinsics").mkdir(exist_ok=True)
             (tmp_path / "lowres_wide_intrinsics" / f"{name}.pincam").write_text("64 48 53 53 32 24")
     np.savetxt(tmp_path / "lowres_wide.traj", lines)
-    made = read(tmp_path)
+    made = read_capture(tmp_path)
     assert len(made.frames) == COUNT and "dropped" not in made.notes
     assert made.notes["without_depth"].startswith("6 of 12 frames have no depth: 1_100.000, 1_100.")
     assert not made.depth.stored[::2].any()

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import colmap, deblur_nerf
 from sharpfield.captures.layouts.colmap_model import camera_of, find_model, read_model
 from sharpfield.core.errors import CaptureError
@@ -95,7 +96,7 @@ def test_intrinsics_follow_smaller_copies_of_the_images(tmp_path):
     camera = colmap.read(tmp_path).camera
     assert camera.size == (16, 12)
     assert (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px) == (20, 21, 8, 6)
-    assert colmap.read(tmp_path, factor=1).camera.fx_px == 40
+    assert colmap.read(tmp_path, ReadOptions(factor=1)).camera.fx_px == 40
 
 
 def test_missing_photos_are_told_or_skipped(tmp_path):
@@ -103,7 +104,7 @@ def test_missing_photos_are_told_or_skipped(tmp_path):
     photos(tmp_path / "images", ("b.png",))
     with pytest.raises(CaptureError, match=re.compile("1 of 2 images are missing.*a b.png", re.S)):
         colmap.read(tmp_path)
-    capture = colmap.read(tmp_path, missing="skip", hold_out="none")
+    capture = colmap.read(tmp_path, ReadOptions(missing="skip", hold_out="none"))
     assert capture.frames.names == ("b",)
     np.testing.assert_array_equal(capture.trajectory.poses, np.eye(3, 4)[None])
 

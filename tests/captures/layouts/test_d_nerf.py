@@ -4,7 +4,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.captures.read import layout_of, read
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 
@@ -30,7 +31,7 @@ def scene(folder: Path, *, times: bool = True) -> Path:
 
 
 def test_a_scene(tmp_path: Path) -> None:
-    found = read(scene(tmp_path))
+    found = read_capture(scene(tmp_path))
     assert found.source == "d-nerf" and (found.near, found.far) == (2.0, 6.0)
     frames = found.needed_frames
     np.testing.assert_array_equal(
@@ -54,15 +55,15 @@ def test_times_tell_it_from_a_scene_that_stands_still(tmp_path: Path) -> None:
 def test_a_damaged_file_is_left_to_the_reader_that_says_so(tmp_path: Path) -> None:
     (tmp_path / "transforms_train.json").write_text("{")
     with pytest.raises(CaptureError, match="not a JSON file"):
-        read(tmp_path)
+        read_capture(tmp_path)
 
 
 def test_missing_images_may_be_skipped(tmp_path: Path) -> None:
     scene(tmp_path)
     (tmp_path / "train" / "r_001.png").unlink()
     with pytest.raises(CaptureError, match="1 of 4 images are missing"):
-        read(tmp_path)
-    found = read(tmp_path, missing="skip")
+        read_capture(tmp_path)
+    found = read_capture(tmp_path, ReadOptions(missing="skip"))
     assert found.needed_frames.names[1] == "train/r_002" and len(found.split.train) == 3
 
 
@@ -70,4 +71,4 @@ def test_sets_of_different_cameras_are_refused(tmp_path: Path) -> None:
     path = scene(tmp_path) / "transforms_test.json"
     path.write_text(path.read_text().replace("0.7", "0.8"))
     with pytest.raises(CaptureError, match="must share one camera"):
-        read(tmp_path)
+        read_capture(tmp_path)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import deblur_nerf
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
@@ -57,7 +58,7 @@ def test_what_is_held_out(tmp_path, marker, option, test):
     written(tmp_path)
     if marker:
         (tmp_path / marker).touch()
-    split = deblur_nerf.read(tmp_path, hold_out=option).split
+    split = deblur_nerf.read(tmp_path, ReadOptions(hold_out=option)).split
     assert split.test.tolist() == test
     assert sorted([*split.train, *split.test]) == list(range(9))
 
@@ -67,9 +68,9 @@ def test_the_smallest_images_are_read_unless_told(tmp_path):
     for i in range(9):
         write_image(tmp_path / "images" / f"{i}.jpg", np.zeros((24, 32, 3), np.uint8))
     assert deblur_nerf.read(tmp_path).camera.size == (8, 6)
-    assert deblur_nerf.read(tmp_path, factor=1).camera.size == (32, 24)
+    assert deblur_nerf.read(tmp_path, ReadOptions(factor=1)).camera.size == (32, 24)
     with pytest.raises(CaptureError, match=re.compile("factor 8.*images, images_4", re.DOTALL)):
-        deblur_nerf.read(tmp_path, factor=8)
+        deblur_nerf.read(tmp_path, ReadOptions(factor=8))
 
 
 def test_a_missing_image_is_told(tmp_path):

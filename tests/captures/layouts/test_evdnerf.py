@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sharpfield.captures.read import layout_of, read
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.captures.writers import evdnerf as write_evdnerf
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
@@ -114,7 +115,7 @@ def sums(events: EventStream, track: int, origin_us: int) -> np.ndarray:
 
 
 def test_what_is_written_is_read(rig: Capture, folder: Path) -> None:
-    found = read(folder)
+    found = read_capture(folder)
     assert layout_of(folder) == found.source == "evdnerf"
     assert found.camera.size == (WIDTH, HEIGHT) and found.camera.fx_px == pytest.approx(11)
     np.testing.assert_allclose(found.trajectory.poses, rig.trajectory.poses, atol=1e-12)
@@ -155,7 +156,7 @@ def test_sums_alone_become_a_stream_with_the_same_sums(
             np.save(path, np.pad(np.load(path), ((0, 0), (0, 1), (0, 0), (0, 0))))
     text = (folder / "transforms_train.json").read_text()
     (folder / "transforms_train.json").write_text(text.replace("threshold_", "was_"))
-    found = read(folder)
+    found = read_capture(folder)
     assert found.known.thresholds.positive == pytest.approx(0.2, rel=1e-6)
     assert "spread evenly" in found.notes["event_times"]
     for track in (0, 1):
@@ -168,29 +169,29 @@ def test_a_threshold_that_does_not_fit_is_told(folder: Path) -> None:
     for path in folder.glob("data_*.npz"):
         path.unlink()
     with pytest.raises(CaptureError, match="not a whole number of thresholds") as caught:
-        read(folder, threshold=0.3)
+        read_capture(folder, ReadOptions(threshold=0.3))
     assert "give the contrast threshold" in str(caught.value)
     np.testing.assert_array_equal(  # half the size, twice the events
-        sums(read(folder, threshold=0.1).needed_events, 0, 0),
-        2 * sums(read(folder).needed_events, 0, 0),
+        sums(read_capture(folder, ReadOptions(threshold=0.1)).needed_events, 0, 0),
+        2 * sums(read_capture(folder).needed_events, 0, 0),
     )
 
 
 @pytest.mark.parametrize("name", ["data_train.npy", "data_train.pkl"])
 def test_pickled_streams_are_read_when_trusted(rig: Capture, folder: Path, name: str) -> None:
-    expected = read(folder).needed_events
+    expected = read_capture(folder).needed_events
     pickled(folder, name, raw(rig))
-    found = read(folder, trust_pickle=True).needed_events
+    found = read_capture(folder, ReadOptions(trust_pickle=True)).needed_events
     for column in ("x", "y", "t_us", "p", "track"):
         np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
 
 
 def test_pickled_streams_are_left_alone_otherwise(rig: Capture, folder: Path) -> None:
     path = pickled(folder, "data_train.npy", raw(rig))
-    assert read(folder).notes["raw_streams"] == f"{path.name} is pickled and was not read"
+    assert read_capture(folder).notes["raw_streams"] == f"{path.name} is pickled and was not read"
     (folder / "data_frames_train.npy").unlink()
     with pytest.raises(CaptureError) as caught:
-        read(folder)
+        read_capture(folder)
     assert str(caught.value) == (
         "CaptureError: the event streams are pickled: opening such a file may run what is in it\n"
         f"  where  {path}\n"
@@ -213,7 +214,7 @@ def test_even_trusted_files_run_nothing(rig: Capture, folder: Path, name: str) -
     Trap.mark = folder / "harm"
     pickled(folder, name, [*raw(rig)[:1], Trap()])
     with pytest.raises(CaptureError, match="which is no array"):
-        read(folder, trust_pickle=True)
+        read_capture(folder, ReadOptions(trust_pickle=True))
     assert not Trap.mark.exists()
     with (folder / name).open("rb") as file:  # the trap is real
         if name.endswith("npy"):
@@ -228,7 +229,7 @@ def test_events_alone_are_enough(folder: Path) -> None:
     shutil.rmtree(folder / "val")
     for path in folder.glob("data_*.npz"):
         path.unlink()
-    found = read(folder)
+    found = read_capture(folder)
     assert found.frames is None and len(found.split.test) == 0 and found.camera.width == WIDTH
 
 
@@ -253,14 +254,14 @@ def test_malformed_transforms_are_told(folder: Path, change, message: str) -> No
     change(about)
     path.write_text(json.dumps(about))
     with pytest.raises(CaptureError, match=message):
-        read(folder)
+        read_capture(folder)
 
 
 def test_sums_of_another_shape_are_told(folder: Path) -> None:
     (folder / "data_train.npz").unlink()
     np.save(folder / "data_frames_train.npy", np.zeros((2, 5, HEIGHT, WIDTH)))
     with pytest.raises(CaptureError, match="do not fit the views") as caught:
-        read(folder)
+        read_capture(folder)
     assert "(2, 16 or 17, height, width)" in str(caught.value)
 
 
@@ -295,7 +296,7 @@ def test_a_longer_recording_is_made_to_last_a_second(rig: Capture, tmp_path: Pat
         ),
     )
     write_evdnerf.write(slow, tmp_path / "slow")
-    found = read(tmp_path / "slow")
+    found = read_capture(tmp_path / "slow")
     assert found.test_events is None
     within = events.window(START_US, START_US + SECOND_US)
     np.testing.assert_array_equal(found.needed_events.t_us, within.t_us - START_US)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.read import layout_of, read
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 
@@ -49,7 +50,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_poses_are_spread_over_the_events(folder: Path) -> None:
-    found = read(folder, event_unit="s")
+    found = read_capture(folder, ReadOptions(event_unit="s"))
     assert layout_of(folder) == found.source == "event-nerf"
     assert found.clock.span_us == 2_000_000 and found.needed_events.bayer == "RGGB"
     assert len(found.needed_events) == COUNT
@@ -63,7 +64,7 @@ def test_poses_are_spread_over_the_events(folder: Path) -> None:
 
 
 def test_other_views_are_held_out(folder: Path) -> None:
-    found = read(folder, event_unit="s")
+    found = read_capture(folder, ReadOptions(event_unit="s"))
     assert len(found.split.train) == 0 and found.split.test.tolist() == [0]
     assert found.needed_frames.names == ("test/r_0",)
     np.testing.assert_allclose(found.frame_pose(np.array([0]))[0], pose(9)[:3], atol=1e-6)
@@ -73,24 +74,24 @@ def test_images_along_the_path_are_on_it(folder: Path) -> None:
     for i in range(POSES):
         image = np.full((HEIGHT, WIDTH, 3), i, np.uint8)
         write_image(folder / "train" / "rgb" / f"r_{i:05d}.png", image)
-    found = read(folder, event_unit="s")
+    found = read_capture(folder, ReadOptions(event_unit="s"))
     np.testing.assert_array_equal(found.split.train, np.arange(5))
     np.testing.assert_allclose(found.frame_pose(np.array([3]))[0], pose(3)[:3], atol=1e-6)
     (folder / "train" / "rgb" / "r_00000.png").unlink()
     with pytest.raises(CaptureError, match="a pose for each train image"):
-        read(folder, event_unit="s")
+        read_capture(folder, ReadOptions(event_unit="s"))
 
 
 def test_the_unit_is_never_guessed(folder: Path) -> None:
     with pytest.raises(CaptureError, match="do not say the unit") as caught:
-        read(folder)
+        read_capture(folder)
     assert "--event-unit" in str(caught.value)
 
 
 def test_distortion_is_in_the_fifth_row(folder: Path) -> None:
     path = folder / "train" / "intrinsics" / "r_00000.txt"
     path.write_text(path.read_text() + " -0.3 0.1 0 0")
-    camera = read(folder, event_unit="s").camera
+    camera = read_capture(folder, ReadOptions(event_unit="s")).camera
     assert camera.lens == "brown" and camera.distortion == (-0.3, 0.1, 0, 0, 0)
 
 
@@ -105,4 +106,4 @@ def test_distortion_is_in_the_fifth_row(folder: Path) -> None:
 def test_malformed_text_is_told(folder: Path, name: str, text: str, message: str) -> None:
     (folder / "train" / name).write_text(text)
     with pytest.raises(CaptureError, match=message):
-        read(folder, event_unit="s")
+        read_capture(folder, ReadOptions(event_unit="s"))

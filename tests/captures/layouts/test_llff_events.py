@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import llff_events
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Known, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
@@ -108,7 +109,7 @@ def change(path, edit):
 
 def test_frames_events_and_poses(blender):
     folder, images, columns = blender
-    capture = read(folder)
+    capture = read_capture(folder)
     assert capture.source == "ev-deblur-nerf" and capture.name == "scene"
     np.testing.assert_array_equal(capture.frames.images, images)
     assert capture.frames.names == tuple(f"{i:02d}" for i in range(9))
@@ -126,7 +127,7 @@ def test_frames_events_and_poses(blender):
 
 def test_axes_become_opencvs(blender):
     folder, _, _ = blender
-    pose = read(folder).trajectory.poses[10]
+    pose = read_capture(folder).trajectory.poses[10]
     angle = 50_000 / 4e5
     np.testing.assert_allclose(pose[:, 0], [np.cos(angle), 0, -np.sin(angle)], atol=1e-12)
     np.testing.assert_allclose(pose[:, 1], [0, -1, 0], atol=1e-12)
@@ -136,7 +137,7 @@ def test_axes_become_opencvs(blender):
 
 def test_the_trajectory_gives_the_poses_of_frames(blender):
     folder, _, _ = blender
-    capture = read(folder)
+    capture = read_capture(folder)
     down, right, backward, centre, _ = np.moveaxis(
         np.load(folder / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5), -1, 0
     )
@@ -146,8 +147,8 @@ def test_the_trajectory_gives_the_poses_of_frames(blender):
 
 def test_what_the_notes_say(blender):
     folder, _, _ = blender
-    assert read(folder).notes == {"event_times": "rounded from ns to us"}
-    assert read(folder).known == Known(thresholds=Thresholds(0.2, 0.2))
+    assert read_capture(folder).notes == {"event_times": "rounded from ns to us"}
+    assert read_capture(folder).known == Known(thresholds=Thresholds(0.2, 0.2))
 
 
 def test_events_without_a_pose_are_dropped_and_counted(blender):
@@ -155,7 +156,7 @@ def test_events_without_a_pose_are_dropped_and_counted(blender):
     columns["t"][:10] = 999_999_000 - np.arange(10)[::-1]
     columns["t"][-2:] = [1_100_000_400, 1_100_000_600]  # rounds to the last stamp; and beyond
     write_columns(folder, columns)
-    capture = read(folder)
+    capture = read_capture(folder)
     assert capture.notes["events_outside_trajectory"] == 11
     assert len(capture.events) == 389 and capture.events.t_us[-1] == 1_100_000
 
@@ -163,7 +164,7 @@ def test_events_without_a_pose_are_dropped_and_counted(blender):
 def test_truth_is_matched_by_name(blender):
     folder, images, _ = blender
     np.savez(folder / "truth.npz", **{"03": images[3] // 2, "07": images[7] // 3})
-    frames = read(folder).frames
+    frames = read_capture(folder).frames
     np.testing.assert_array_equal(np.flatnonzero(frames.truth_known), [3, 7])
     np.testing.assert_array_equal(frames.truth[3], images[3] // 2)
     np.testing.assert_array_equal(frames.truth[7], images[7] // 3)
@@ -172,12 +173,12 @@ def test_truth_is_matched_by_name(blender):
 def test_smaller_images_have_a_shorter_focal_length(blender):
     folder, _, _ = blender
     (folder / "images_1").rename(folder / "images_4")
-    assert read(folder).camera.fx_px == 11.0 / 4
+    assert read_capture(folder).camera.fx_px == 11.0 / 4
 
 
 def test_options_overrule_the_layout(blender):
     folder, _, _ = blender
-    capture = read(folder, encoding="srgb", hold_out="last:2", threshold=0.3)
+    capture = read_capture(folder, ReadOptions(encoding="srgb", hold_out="last:2", threshold=0.3))
     assert capture.frames.encoding == "srgb"
     np.testing.assert_array_equal(capture.split.test, [7, 8])
     assert capture.known.thresholds == Thresholds(0.3, 0.3)
@@ -186,9 +187,11 @@ def test_options_overrule_the_layout(blender):
 @pytest.mark.parametrize(("unit", "factor"), [("ns", 1), ("us", 1e-3), ("ms", 1e-6), ("s", 1e-9)])
 def test_other_units_can_be_told(blender, unit, factor):
     folder, _, columns = blender
-    expected = read(folder).events.t_us
+    expected = read_capture(folder).events.t_us
     write_columns(folder, columns | {"t": columns["t"] * factor})
-    np.testing.assert_array_equal(read(folder, event_unit=unit).events.t_us, expected)
+    np.testing.assert_array_equal(
+        read_capture(folder, ReadOptions(event_unit=unit)).events.t_us, expected
+    )
 
 
 def test_a_file_that_states_its_unit_is_believed(blender):
@@ -196,7 +199,7 @@ def test_a_file_that_states_its_unit_is_believed(blender):
     write_columns(folder, columns | {"t": columns["t"] // 1000})
     with h5py.File(folder / "events.h5", "a") as file:
         file.attrs["tick_ns"] = 1000
-    capture = read(folder)
+    capture = read_capture(folder)
     assert capture.events.t_us[0] == columns["t"][0] // 1000
     assert "event_times" not in capture.notes
 
@@ -206,7 +209,7 @@ def test_a_file_that_states_its_unit_is_believed(blender):
 
 def test_rectified_events_know_their_colour(davis):
     folder, (row, column), columns = davis
-    capture = read(folder)
+    capture = read_capture(folder)
     assert capture.events.rectified and capture.events.coloured
     np.testing.assert_array_equal(capture.events.x, columns["x"])
     np.testing.assert_array_equal(capture.events.p, columns["p"])
@@ -222,7 +225,7 @@ def test_rectified_events_know_their_colour(davis):
 
 def test_what_differs_from_blender(davis):
     folder, _, _ = davis
-    capture = read(folder)
+    capture = read_capture(folder)
     assert capture.frames.encoding == "linear"
     np.testing.assert_array_equal(capture.split.test, range(4, 9))
     assert capture.known.reference_poses == "trajectory"
@@ -233,7 +236,7 @@ def test_what_differs_from_blender(davis):
 
 def test_stills_from_before_have_tracks_of_their_own(davis):
     folder, _, _ = davis
-    capture = read(folder)
+    capture = read_capture(folder)
     np.testing.assert_array_equal(capture.frames.track, [0, 0, 0, 0, 1, 2, 3, 4, 5])
     np.testing.assert_allclose(
         capture.frame_pose(np.arange(4, 9))[:, :, 3],
@@ -252,7 +255,7 @@ def test_a_frame_that_contradicts_the_trajectory_has_its_own_track(blender):
         rows[6, 3] += 0.5 / 11 * 1.51
 
     change(folder / "poses_bounds.npy", move)
-    capture = read(folder)
+    capture = read_capture(folder)
     np.testing.assert_array_equal(capture.frames.track, [0, 0, 0, 0, 0, 1, 0, 0, 0])
     expected = np.load(folder / "poses_bounds.npy")[5, 3]
     assert capture.frame_pose(np.array([5]))[0, 0, 3] == pytest.approx(expected, abs=1e-6)
@@ -264,7 +267,7 @@ def test_float32_poses_are_orthonormal_enough(blender):
     folder, _, _ = blender
     for name in ("poses_bounds.npy", "all_poses_bounds.npy"):
         change(folder / name, lambda rows: rows.astype(np.float32))
-    assert (read(folder).frames.track == 0).all()
+    assert (read_capture(folder).frames.track == 0).all()
 
 
 # What can be wrong
@@ -272,7 +275,7 @@ def test_float32_poses_are_orthonormal_enough(blender):
 
 def fails(folder, *parts):
     with pytest.raises(CaptureError) as caught:
-        read(folder)
+        read_capture(folder)
     message = str(caught.value)
     for part in parts:
         assert part in message
@@ -437,7 +440,7 @@ def test_atelier(samples):
     folder = samples / "blender" / "atelier"
     if not folder.is_dir():
         pytest.skip("no blender/atelier among the sample recordings")
-    capture = read(folder)
+    capture = read_capture(folder)
     assert llff_events.recognise(folder)
     assert len(capture.events) == 1_820_374
     assert capture.frames.images.shape == (18, 200, 300, 3)

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import nerf_synthetic
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
@@ -67,9 +68,9 @@ def test_missing_images_are_told_or_skipped(tmp_path):
         "CaptureError: 4 of 12 images are missing\n"
         f"  where  {tmp_path}/transforms_train.json\n"
         f"  got    no r_1.png, r_3.png, r_5.png, ... in {tmp_path}/train\n"
-        "  do     complete the download, or read with missing='skip' to use those that are there"
+        "  do     complete the download, or set the option `missing` to skip"
     )
-    capture = nerf_synthetic.read(tmp_path, missing="skip")
+    capture = nerf_synthetic.read(tmp_path, ReadOptions(missing="skip"))
     assert capture.frames.names[:3] == ("train/r_0", "train/r_2", "train/r_4")
     assert capture.trajectory.poses[:3, 2, 3].tolist() == [0, 2, 4]
 
@@ -115,7 +116,7 @@ def test_a_published_scene(samples, tmp_path):
     content["frames"] = content["frames"][:8]
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     (tmp_path / "train").symlink_to(lego / "train")
-    capture = nerf_synthetic.read(tmp_path, missing="skip")
+    capture = nerf_synthetic.read(tmp_path, ReadOptions(missing="skip"))
     assert capture.frames.images.shape == (4, 800, 800, 3)
     assert capture.camera.fx_px == pytest.approx(1111.1110, abs=1e-3)
     towards = -(capture.trajectory.poses[:, :, 3] * capture.trajectory.poses[:, :, 2]).sum(-1)

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import nerfstudio
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
@@ -79,7 +80,7 @@ def test_bounds_are_guessed_from_what_the_cameras_look_at(tmp_path):
     capture = nerfstudio.read(tmp_path)
     assert (capture.near, capture.far) == pytest.approx((0.5, 50))
     assert capture.known.bounds == "estimated"
-    told = nerfstudio.read(tmp_path, bounds=(1.0, 7.0))
+    told = nerfstudio.read(tmp_path, ReadOptions(bounds=(1.0, 7.0)))
     assert (told.near, told.far) == (1, 7)
     assert told.known.bounds == "known"
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sharpfield.captures.read import layout_of, read
+from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
@@ -68,7 +68,7 @@ def views(folder: Path, size: tuple[int, int] = (HEIGHT, WIDTH)) -> None:
 
 
 def test_a_scene(folder: Path) -> None:
-    found = read(folder)
+    found = read_capture(folder)
     assert layout_of(folder) == found.source == "robust-e-nerf"
     camera = found.camera
     assert (camera.width, camera.height, camera.lens) == (WIDTH, HEIGHT, "pinhole")
@@ -88,7 +88,7 @@ def test_a_scene(folder: Path) -> None:
 @pytest.mark.parametrize("beside", [False, True])
 def test_images_to_be_predicted(folder: Path, beside: bool) -> None:
     views(folder.parent if beside else folder)
-    found = read(folder)
+    found = read_capture(folder)
     assert found.split.test.tolist() == [0] and len(found.split.train) == 0
     expected = np.eye(4)[:3]
     expected[2, 3] = -3
@@ -97,14 +97,14 @@ def test_images_to_be_predicted(folder: Path, beside: bool) -> None:
 
 def test_images_of_another_camera_are_left_out(folder: Path) -> None:
     views(folder, (HEIGHT, WIDTH + 1))
-    found = read(folder)
+    found = read_capture(folder)
     assert found.frames is None and "another size" in found.notes["views"]
 
 
 def test_a_real_cameras_thresholds_are_not_known(folder: Path) -> None:
     change = {"pos_contrast_threshold": np.array(np.nan)}
     np.savez(folder / "camera_calibration.npz", **calibration(**change))
-    assert read(folder).known.thresholds is None
+    assert read_capture(folder).known.thresholds is None
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_lenses(folder: Path, model: str, lens: str, count: int) -> None:
     bent = np.array([-0.1, 0.02, 0.001, 0.002])
     change = {"distortion_params": bent, "distortion_model": np.array(model)}
     np.savez(folder / "camera_calibration.npz", **calibration(**change))
-    camera = read(folder).camera
+    camera = read_capture(folder).camera
     assert camera.lens == lens and len(camera.distortion) == count
     assert camera.distortion[:4] == pytest.approx(bent)
 
@@ -123,7 +123,7 @@ def test_what_is_not_supported_or_missing_is_told(folder: Path) -> None:
     change = {"distortion_params": np.ones(4), "distortion_model": np.array("fov")}
     np.savez(folder / "camera_calibration.npz", **calibration(**change))
     with pytest.raises(CaptureError, match="distortion model is not supported"):
-        read(folder)
+        read_capture(folder)
     np.savez(folder / "camera_calibration.npz", intrinsics=np.eye(3))
     with pytest.raises(CaptureError, match="array img_height is missing"):
-        read(folder)
+        read_capture(folder)

@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.captures.writers import llff_events as write_llff_events
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Known, Split, Thresholds
@@ -15,7 +15,7 @@ from sharpfield.geometry.trajectory import Stamped, Still, Tracks
 
 def returned(capture, tmp_path):
     write_llff_events.write(capture, tmp_path / "scene")
-    return read(tmp_path / "scene")
+    return read_capture(tmp_path / "scene")
 
 
 def expect_same_frames(found, capture):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
@@ -189,7 +189,7 @@ def test_frames_and_events_of_one_file(truth, tmp_path, container):
 def test_what_was_ingested_waits_for_its_poses(truth, tmp_path):
     _, folder = ingested(truth, tmp_path)
     with pytest.raises(CaptureError, match="the poses of the camera are unknown"):
-        read(folder)
+        read_capture(folder)
 
 
 def test_with_poses_and_lens_it_can_be_trained_on(truth, tmp_path):
@@ -203,7 +203,7 @@ def test_with_poses_and_lens_it_can_be_trained_on(truth, tmp_path):
     scene = replace(SAME.scene, poses=tmp_path / "path.npz", near=truth.near, far=truth.far)
     optics = Optics(calibration=tmp_path / "calib.txt")
     made, folder = ingested(truth, tmp_path, replace(SAME, scene=scene, optics=optics))
-    found = read(folder)
+    found = read_capture(folder)
     assert made.unknown == ()
     assert found.camera == camera
     middle = np.array([3])

@@ -9,11 +9,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
+from sharpfield.captures.layout import Missing
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import CaptureError
@@ -25,9 +25,6 @@ SECOND_US = 1_000_000
 
 HOLD_OUT = "every:8"
 """LLFF's rule of what to hold out, see `captures.hold_out`."""
-
-Missing = Literal["error", "skip"]
-"""What to do about images that are named but not there."""
 
 
 PHOTOS = Known(motion="unknown")
@@ -120,21 +117,23 @@ def choose_images(folder: Path, factor: int | None) -> Path:
     return found[max(found) if factor is None else factor]
 
 
-def existing(paths: Sequence[Path], *, missing: Missing, where: object) -> Int64[np.ndarray, "m"]:
+def existing(
+    paths: Sequence[Path], *, missing: Missing | None, where: object
+) -> Int64[np.ndarray, "m"]:
     """Indices of the files that are there.
 
     Raises:
-        CaptureError: Some are not and `missing` is "error", or none is there.
+        CaptureError: Some are not and `missing` is not "skip", or none is there.
     """
     there = np.array([path.is_file() for path in paths], bool)
     gone = np.flatnonzero(~there)
-    if len(gone) and (missing == "error" or not there.any()):
+    if len(gone) and (missing != "skip" or not there.any()):
         named = ", ".join(paths[i].name for i in gone[:3])
         raise CaptureError(
             f"{len(gone)} of {len(paths)} images are missing",
             where=where,
             got=f"no {named}{', ...' if len(gone) > 3 else ''} in {paths[gone[0]].parent}",
-            do="complete the download, or read with missing='skip' to use those that are there",
+            do="complete the download, or set the option `missing` to skip",
         )
     return np.flatnonzero(there)
 

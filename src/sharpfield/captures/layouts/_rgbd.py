@@ -67,8 +67,6 @@ def rgbd_capture(
     *,
     folder: Path,
     source: str,
-    bounds: tuple[float, float] = BOUNDS,
-    encoding: str = "srgb",
     points: Float64[np.ndarray, "m 3"] | None = None,
 ) -> Capture:
     """A capture of a depth camera's recording.
@@ -78,8 +76,6 @@ def rgbd_capture(
         split: What to hold out of so many frames; poses that failed do not count.
         folder: Of the recording; names it.
         source: The layout.
-        bounds: Nearest and farthest depth.
-        encoding: How stored values relate to light.
         points: Scene points that came with it.
 
     Raises:
@@ -105,12 +101,11 @@ def rgbd_capture(
         poses=frames.poses[kept],
         names=[frames.names[i] for i in kept.tolist()],
         camera=camera,
-        encoding=encoding,
     )
     made = photo_capture(
         photos,
         split(len(kept)),
-        bounds=bounds,
+        bounds=BOUNDS,
         name=folder.resolve().name,
         source=source,
         points=points,

@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Bool, Float64, Shaped
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import RgbdFrames, read_matrix, rgbd_capture
 from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT, rgb
 from sharpfield.captures.native.frames import decode_depth
@@ -45,13 +46,12 @@ def recognise(folder: Path) -> bool:
     return (folder / WIDE).is_dir() and (folder / TRAJECTORY).is_file()
 
 
-def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb") -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a recording.
 
     Args:
         folder: Holds what the module describes.
-        hold_out: Which frames to hold out.
-        encoding: How stored values relate to light.
+        options: `hold_out`.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -76,10 +76,9 @@ def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb
     )
     made = rgbd_capture(
         frames,
-        lambda count: split_by_rule(count, hold_out),
+        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
         folder=folder,
         source="arkitscenes",
-        encoding=encoding,
     )
     return replace(made, notes=made.notes | {"focal_spread": spread})
 
@@ -147,3 +146,6 @@ def _poses(path: Path, times_s: Sequence[float]) -> Float64[np.ndarray, "n 3 4"]
     unit = torch.from_numpy(clock.unit(asked[inside]))
     found[inside] = way.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).double().numpy()
     return found
+
+
+LAYOUT = Layout("arkitscenes", recognise, read, "lowres_wide/ and lowres_wide.traj")

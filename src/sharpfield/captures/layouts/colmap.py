@@ -10,9 +10,9 @@ Intrinsics are scaled to the size of the images that are read. Depth bounds come
 from pathlib import Path
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
-    Missing,
     Photos,
     choose_images,
     depth_bounds,
@@ -36,24 +36,13 @@ def recognise(folder: Path) -> bool:
     )
 
 
-def read(
-    folder: Path,
-    *,
-    factor: int | None = None,
-    hold_out: str = HOLD_OUT,
-    bounds: tuple[float, float] | None = None,
-    missing: Missing = "error",
-    encoding: str = "srgb",
-) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read photos and their reconstruction.
 
     Args:
         folder: Holds what the module describes.
-        factor: Read `images_<factor>`; by default the smallest images there are.
-        hold_out: Which photos to hold out, e.g. `every:8`, `last:5` or `none`.
-        bounds: Nearest and farthest depth; by default what the points show.
-        missing: What to do about photos of the model that are not there.
-        encoding: How stored values relate to light.
+        options: `factor` of the images, by default the smallest there are; `hold_out`; `bounds`,
+            by default what the points show; `missing` photos of the model.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -62,20 +51,19 @@ def read(
     if place is None:
         raise CaptureError("no COLMAP model", where=folder, do="put one in sparse/0")
     model = read_model(place)
-    paths = _image_paths(choose_images(folder, factor), model)
-    kept = existing(paths, missing=missing, where=place)
+    paths = _image_paths(choose_images(folder, options.factor), model)
+    kept = existing(paths, missing=options.missing, where=place)
     names = [model.names[i] for i in kept]
     photos = Photos(
         images=read_images([paths[i] for i in kept]),
         poses=model.poses[kept],
         names=[Path(name).with_suffix("").as_posix() for name in names],
         camera=same_camera([model.cameras[i] for i in kept], names, where=place),
-        encoding=encoding,
     )
     return photo_capture(
         photos,
-        split_by_rule(len(kept), hold_out),
-        bounds=bounds or depth_bounds(model.points, model.poses, model.seen, where=place),
+        split_by_rule(len(kept), options.hold_out or HOLD_OUT),
+        bounds=options.bounds or depth_bounds(model.points, model.poses, model.seen, where=place),
         name=folder.resolve().name,
         source="colmap",
         points=model.points if len(model.points) else None,
@@ -93,3 +81,12 @@ def _with_any_suffix(path: Path) -> Path:
         *(path.with_suffix(s) for suffix in SUFFIXES for s in (suffix, suffix.upper())),
     ]
     return next((candidate for candidate in candidates if candidate.is_file()), path)
+
+
+LAYOUT = Layout(
+    "colmap",
+    recognise,
+    read,
+    "sparse/0/cameras.bin and images*/",
+    options=("factor", "missing"),
+)

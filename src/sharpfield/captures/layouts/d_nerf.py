@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.captures.layouts._photos import Missing, existing
+from sharpfield.captures.layout import NO_OPTIONS, Layout, Missing, ReadOptions
+from sharpfield.captures.layouts._photos import existing
 from sharpfield.captures.layouts._transforms import (
     ONE_SECOND,
     TimedViews,
@@ -35,19 +36,19 @@ def recognise(folder: Path) -> bool:
     return has_times(folder / "transforms_train.json")
 
 
-def read(folder: Path, *, missing: Missing = "error", encoding: str = "srgb") -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene, composited on white. The test set is held out, or else the validation set.
 
     Args:
         folder: Holds what the module describes.
-        missing: What to do about images that are named but not there.
-        encoding: How stored values relate to light; Blender stores sRGB.
+        options: `missing` images.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
     """
     sets = [
-        _kept(read_views(folder / f"transforms_{name}.json"), missing) for name in _sets(folder)
+        _kept(read_views(folder / f"transforms_{name}.json"), options.missing)
+        for name in _sets(folder)
     ]
     expect_one_camera(sets, folder)
     images = images_of(sets, alpha="white")
@@ -66,7 +67,7 @@ def read(folder: Path, *, missing: Missing = "error", encoding: str = "srgb") ->
             exposure=Exposure(t_us, t_us),
             track=every,
             names=tuple(name for one in sets for name in one.names),
-            encoding=encoding,
+            encoding="srgb",
         ),
         split=Split(every[:train], every[train:]),
         name=folder.resolve().name,
@@ -86,7 +87,7 @@ def _sets(folder: Path) -> list[str]:
     return there[:2]
 
 
-def _kept(views: TimedViews, missing: Missing) -> TimedViews:
+def _kept(views: TimedViews, missing: Missing | None) -> TimedViews:
     """The frames whose image is there."""
     kept = existing(views.paths, missing=missing, where=views.paths[0].parent)
     return TimedViews(
@@ -97,3 +98,12 @@ def _kept(views: TimedViews, missing: Missing) -> TimedViews:
         angle_rad=views.angle_rad,
         focal_px=views.focal_px,
     )
+
+
+LAYOUT = Layout(
+    "d-nerf",
+    recognise,
+    read,
+    "transforms_train.json with a `time` in each frame",
+    options=("missing",),
+)

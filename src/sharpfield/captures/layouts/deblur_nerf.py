@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import HOLD_OUT, Photos, choose_images, photo_capture
 from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.captures.layouts.colmap_model import find_model, read_model
@@ -37,26 +38,18 @@ def recognise(folder: Path) -> bool:
     )
 
 
-def read(
-    folder: Path,
-    *,
-    factor: int | None = None,
-    hold_out: str | None = None,
-    encoding: str = "gamma2.2",
-) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene.
 
     Args:
         folder: Holds what the module describes.
-        factor: Read `images_<factor>`; by default the smallest images there are, which is what
-            the papers train on.
-        hold_out: Which photos to hold out, e.g. `every:8`; by default as the marker file says.
-        encoding: How stored values relate to light; the papers assume a gamma of 2.2.
+        options: `factor` of the images, by default the smallest there are, which is what the
+            papers train on; `hold_out`, by default as the marker file says.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
     """
-    images_folder = choose_images(folder, factor)
+    images_folder = choose_images(folder, options.factor)
     table = read_poses_bounds(folder / "poses_bounds.npy")
     paths = list_images(images_folder)
     if len(paths) != len(table):
@@ -73,11 +66,11 @@ def read(
         camera=Camera(
             width, height, table.focal_px, table.focal_px, cx_px=width / 2, cy_px=height / 2
         ),
-        encoding=encoding,
+        encoding="gamma2.2",
     )
     return photo_capture(
         photos,
-        split_by_rule(len(paths), hold_out or _hold_out(folder)),
+        split_by_rule(len(paths), options.hold_out or _hold_out(folder)),
         bounds=(float(table.bounds.min()), float(table.bounds.max())),
         name=folder.resolve().name,
         source="deblur-nerf",
@@ -107,3 +100,8 @@ def _points(folder: Path, table: PosesBounds) -> Float64[np.ndarray, "m 3"] | No
         return None
     apart = np.linalg.norm(model.poses[:, :, 3] - table.poses[:, :, 3], axis=-1).max()
     return model.points if apart < SAME_PLACE * table.bounds.min() else None
+
+
+LAYOUT = Layout(
+    "deblur-nerf", recognise, read, "poses_bounds.npy and images*/", options=("factor",)
+)

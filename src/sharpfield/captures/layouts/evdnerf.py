@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Int64, Shaped
 
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._transforms import (
     ONE_SECOND,
     TimedViews,
@@ -139,14 +140,14 @@ def recognise(folder: Path) -> bool:
     )
 
 
-def read(folder: Path, *, trust_pickle: bool = False, threshold: float | None = None) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read all views.
 
     Args:
         folder: Holds what the module describes.
-        trust_pickle: Open pickled files. A pickle can name programs to run; only arrays of
-            numbers are built from it, and anything else is refused.
-        threshold: What one event adds to the sums, where the smallest of them does not say.
+        options: `trust_pickle` opens pickled files. A pickle can name programs to run; only
+            arrays of numbers are built from it, and anything else is refused. `threshold` is
+            what one event adds to the sums, where the smallest of them does not say.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together; or there is
@@ -158,7 +159,7 @@ def read(folder: Path, *, trust_pickle: bool = False, threshold: float | None = 
         if name == "train" or (folder / f"transforms_{name}.json").is_file()
     ]
     expect_one_camera([one.views for one in sets], folder)
-    streams, known, notes = _streams(folder, sets, trust_pickle=trust_pickle, threshold=threshold)
+    streams, known, notes = _streams(folder, sets, options)
     images = images_of([one.views for one in sets])
     camera = _camera(sets[0].views, streams, images, folder)
     poses = np.concatenate([one.poses for one in sets])
@@ -207,10 +208,11 @@ def _set(folder: Path, name: str) -> _Set:
 
 
 def _streams(
-    folder: Path, sets: list[_Set], *, trust_pickle: bool, threshold: float | None
+    folder: Path, sets: list[_Set], options: ReadOptions
 ) -> tuple[list[EventStream], Thresholds | None, dict[str, Note]]:
     """The events of each view of all sets, their thresholds, and remarks."""
     streams: list[EventStream] = []
+    threshold = options.threshold
     notes: dict[str, Note] = {"clock": "said to last one second"}
     for one in sets:
         plain, sums = folder / f"data_{one.name}.npz", folder / f"data_frames_{one.name}.npy"
@@ -219,7 +221,7 @@ def _streams(
         if plain.is_file():
             found = [array for _, array in sorted(load_arrays(plain).items())]
             streams += [_raw(array, plain) for array in _one_each(found, one, plain)]
-        elif pickled and trust_pickle:
+        elif pickled and options.trust_pickle:
             found = load_pickled(pickled[0])
             streams += [_raw(array, pickled[0]) for array in _one_each(found, one, pickled[0])]
         elif sums.is_file():
@@ -351,3 +353,12 @@ def _split(sets: list[_Set], *, has_images: bool) -> Split:
     test = np.arange(len(sets[1].views))
     chosen = test % (len(test) // sets[1].count) % TEST_EVERY == TEST_EVERY // 2
     return Split(np.arange(train), train + test[chosen])
+
+
+LAYOUT = Layout(
+    "evdnerf",
+    recognise,
+    read,
+    "transforms_train.json and data_frames_train.npy",
+    options=("trust_pickle",),
+)

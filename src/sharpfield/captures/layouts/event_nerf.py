@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts.nerfstudio import guessed_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split
@@ -39,12 +40,12 @@ def recognise(folder: Path) -> bool:
     return (train / "pose").is_dir() and any((train / "events").glob("*.npz"))
 
 
-def read(folder: Path, *, event_unit: str | None = None) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read the events, the poses, and the images if there are any.
 
     Args:
         folder: Holds what the module describes.
-        event_unit: Of the event times: ns, us, ms or s. Required.
+        options: `event_unit` is required.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together, or the unit is
@@ -55,7 +56,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     if len(files) != 1:
         raise CaptureError("there must be one file of events", where=train / "events", got=files)
     poses, camera = _poses(train), _camera(train)
-    with open_events(files[0], unit=event_unit, size=SENSOR) as file:
+    with open_events(files[0], unit=options.event_unit, size=SENSOR) as file:
         if file.unit is None:
             raise CaptureError(
                 "EventNeRF's files do not say the unit of their event times",
@@ -157,3 +158,12 @@ def _numbers(path: Path, counts: tuple[int, ...]) -> Shaped[np.ndarray, "n"]:
             f"there must be {' or '.join(map(str, counts))} numbers", where=path, got=len(numbers)
         )
     return numbers
+
+
+LAYOUT = Layout(
+    "event-nerf",
+    recognise,
+    read,
+    "train/pose/, train/intrinsics/ and train/events/*.npz",
+    options=("event_unit",),
+)

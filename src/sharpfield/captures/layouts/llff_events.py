@@ -28,6 +28,7 @@ from jaxtyping import Bool, Int64, Shaped
 
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import choose_images
 from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
@@ -43,8 +44,6 @@ from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_columns import whole_us
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.images import list_images, read_images
-
-LAYOUT = "ev-deblur-nerf"
 
 TRAJECTORY = ("all_poses_bounds.npy", "all_timestamps.npy")
 
@@ -84,7 +83,7 @@ def variant_of(folder: Path) -> Variant:
     return COLOR_DAVIS if (folder / "ev_map.npz").is_file() else BLENDER
 
 
-def read(folder: Path, *, event_unit: str | None = None) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene.
 
     Frames taken on the trajectory are on track 0. A sharp frame taken before or after it, and any
@@ -92,8 +91,8 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
 
     Args:
         folder: Holds what the module describes.
-        event_unit: Of the event times, where it is not what the data sets have (ns without
-            `ev_map.npz`, us with it).
+        options: `event_unit` where it is not what the data sets have (ns without `ev_map.npz`,
+            us with it); `hold_out`.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -111,7 +110,7 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
     off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
     trajectory, track = _tracks(path, table, off)
     events, thresholds, notes = _events(
-        folder, camera, path, event_unit=event_unit, variant=variant
+        folder, camera, path, event_unit=options.event_unit, variant=variant
     )
     names = tuple(file.stem for file in paths)
     truth, truth_known = _truth(folder / "truth.npz", names, images)
@@ -123,9 +122,9 @@ def read(folder: Path, *, event_unit: str | None = None) -> Capture:
         far=float(bounds.max()),
         frames=Frames(images, exposure, track, names, variant.encoding, truth, truth_known),
         events=events,
-        split=split_by_rule(len(paths), variant.hold_out),
+        split=split_by_rule(len(paths), options.hold_out or variant.hold_out),
         name=folder.resolve().name,
-        source=LAYOUT,
+        source="ev-deblur-nerf",
         known=Known(thresholds=thresholds, reference_poses=variant.reference_poses),
         notes=notes
         | ({"frames_off_trajectory": ", ".join(np.array(names)[off])} if off.any() else {}),
@@ -275,3 +274,12 @@ def _expect_one_each(where: object, **counts: int) -> None:
             got=", ".join(f"{count} {name}" for name, count in counts.items()),
             do="check for images that were added or removed afterwards",
         )
+
+
+LAYOUT = Layout(
+    "ev-deblur-nerf",
+    recognise,
+    read,
+    "poses_bounds.npy, all_poses_bounds.npy and events.h5",
+    options=("event_unit",),
+)

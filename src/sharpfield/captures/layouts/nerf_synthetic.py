@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from sharpfield.captures.hold_out import split_by_rule
-from sharpfield.captures.layouts._photos import HOLD_OUT, Missing, Photos, existing, photo_capture
+from sharpfield.captures.layout import NO_OPTIONS, Layout, Missing, ReadOptions
+from sharpfield.captures.layouts._photos import HOLD_OUT, Photos, existing, photo_capture
 from sharpfield.captures.layouts._transforms import (
     frame_name,
     frames_of,
@@ -38,13 +39,7 @@ def recognise(folder: Path) -> bool:
     return (folder / "transforms_train.json").is_file()
 
 
-def read(
-    folder: Path,
-    *,
-    missing: Missing = "error",
-    bounds: tuple[float, float] = BOUNDS,
-    encoding: str = "srgb",
-) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene, composited on white.
 
     The test set is held out, or where there is none the validation set, or where there is
@@ -52,14 +47,14 @@ def read(
 
     Args:
         folder: Holds what the module describes.
-        missing: What to do about images that are named but not there.
-        bounds: Nearest and farthest depth.
-        encoding: How stored values relate to light; Blender stores sRGB.
+        options: `missing` images; `hold_out`, where there is a training set only.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
     """
-    sets = {name: _frames(folder / f"transforms_{name}.json", missing) for name in _sets(folder)}
+    sets = {
+        name: _frames(folder / f"transforms_{name}.json", options.missing) for name in _sets(folder)
+    }
     frames = [frame for members in sets.values() for frame in members]
     paths = [image_path(folder, frame["file_path"]) for frame in frames]
     images = read_images(paths, alpha="white")
@@ -77,12 +72,11 @@ def read(
         poses=poses_of(frames, folder),
         names=[frame_name(frame["file_path"]) for frame in frames],
         camera=Camera(width, height, focal, focal, width / 2, height / 2),
-        encoding=encoding,
     )
     return photo_capture(
         photos,
-        _split([len(members) for members in sets.values()]),
-        bounds=bounds,
+        _split([len(members) for members in sets.values()], options.hold_out or HOLD_OUT),
+        bounds=BOUNDS,
         name=folder.resolve().name,
         source="nerf-synthetic",
         known=Known(background="white"),
@@ -97,7 +91,7 @@ def _sets(folder: Path) -> list[str]:
     return there[:2]
 
 
-def _frames(path: Path, missing: Missing) -> list[dict[str, Any]]:
+def _frames(path: Path, missing: Missing | None) -> list[dict[str, Any]]:
     """Frames whose image is there; the field of view, which all share, is put in each."""
     content = read_json(path)
     angle = number(content, "camera_angle_x", path)
@@ -109,11 +103,14 @@ def _frames(path: Path, missing: Missing) -> list[dict[str, Any]]:
     return [{**frames[i], "camera_angle_x": angle} for i in kept]
 
 
-def _split(counts: list[int]) -> Split:
+def _split(counts: list[int], hold_out: str) -> Split:
     if len(counts) == 1:
-        return split_by_rule(counts[0], HOLD_OUT)
+        return split_by_rule(counts[0], hold_out)
     train, test = counts
     return Split(
         train=np.arange(train, dtype=np.int64),
         test=np.arange(train, train + test, dtype=np.int64),
     )
+
+
+LAYOUT = Layout("nerf-synthetic", recognise, read, "transforms_train.json", options=("missing",))

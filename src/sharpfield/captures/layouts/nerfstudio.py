@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
     PHOTOS,
-    Missing,
     Photos,
     existing,
     photo_capture,
@@ -51,21 +51,13 @@ def recognise(folder: Path) -> bool:
     return (folder / "transforms.json").is_file()
 
 
-def read(
-    folder: Path,
-    *,
-    bounds: tuple[float, float] | None = None,
-    missing: Missing = "error",
-    encoding: str = "srgb",
-) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene.
 
     Args:
         folder: Holds `transforms.json`.
-        bounds: Nearest and farthest depth; by default guessed from where the cameras look, since
-            the format does not say.
-        missing: What to do about images that are named but not there.
-        encoding: How stored values relate to light.
+        options: `bounds`, by default guessed from where the cameras look, since the format does
+            not say; `missing` images; `hold_out`, where no list of frames says.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -74,22 +66,21 @@ def read(
     content = read_json(path)
     frames = sorted(frames_of(content, path), key=lambda frame: frame["file_path"])
     paths = [image_path(folder, frame["file_path"]) for frame in frames]
-    kept = existing(paths, missing=missing, where=path)
+    kept = existing(paths, missing=options.missing, where=path)
     frames, paths = [frames[i] for i in kept], [paths[i] for i in kept]
     names = [frame_name(frame["file_path"]) for frame in frames]
     poses = poses_of(frames, path)
-    known = PHOTOS if bounds else replace(PHOTOS, bounds="estimated")
+    known = PHOTOS if options.bounds else replace(PHOTOS, bounds="estimated")
     photos = Photos(
         images=read_images(paths),
         poses=poses,
         names=names,
         camera=same_camera([_camera({**content, **f}, path) for f in frames], names, where=path),
-        encoding=encoding,
     )
     return photo_capture(
         photos,
-        _split(content, names, path),
-        bounds=bounds or guessed_bounds(poses),
+        _split(content, names, path, options.hold_out or HOLD_OUT),
+        bounds=options.bounds or guessed_bounds(poses),
         name=folder.resolve().name,
         source="nerfstudio",
         points=_points(folder, content, path),
@@ -144,13 +135,13 @@ def _camera(content: dict[str, Any], path: Path) -> Camera:
     return Camera(width, height, fx, fy, cx, cy, lens.name, distortion)
 
 
-def _split(content: dict[str, Any], names: list[str], path: Path) -> Split:
+def _split(content: dict[str, Any], names: list[str], path: Path, hold_out: str) -> Split:
     listed = {
         kind: {frame_name(file) for file in content.get(f"{kind}_filenames", [])}
         for kind in ("train", "test", "val")
     }
     if not any(listed.values()):
-        return split_by_rule(len(names), HOLD_OUT)
+        return split_by_rule(len(names), hold_out)
     test = listed["test"] or listed["val"]
     train = listed["train"] or set(names) - test
     known = np.array(names)
@@ -163,3 +154,6 @@ def _split(content: dict[str, Any], names: list[str], path: Path) -> Split:
             "none of the frames is for training", where=f"{path}, key `train_filenames`"
         )
     return split
+
+
+LAYOUT = Layout("nerfstudio", recognise, read, "transforms.json", options=("missing",))

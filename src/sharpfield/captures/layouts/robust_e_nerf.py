@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Shaped
 
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._transforms import (
     frame_name,
     frames_of,
@@ -54,7 +55,7 @@ def recognise(folder: Path) -> bool:
     return all((folder / file).is_file() for file in (EVENTS, POSES, CALIBRATION))
 
 
-def read(folder: Path) -> Capture:
+def read(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read the events, the poses, and the images to be predicted.
 
     Raises:
@@ -200,3 +201,11 @@ def _views(folder: Path, camera: Camera, clock: Clock) -> _Views:
         encoding="srgb",
     )
     return _Views(seen, poses_of(frames, path))
+
+
+LAYOUT = Layout(
+    "robust-e-nerf",
+    recognise,
+    read,
+    "raw_events.npz, camera_poses.npz and camera_calibration.npz",
+)

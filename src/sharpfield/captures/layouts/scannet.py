@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
-    BOUNDS,
     RgbdFrames,
     pinhole,
     read_matrix,
@@ -53,20 +53,12 @@ def recognise(folder: Path) -> bool:
     return (place / POSE).is_dir() and (place / INTRINSIC_COLOUR).is_file() and bool(_colour(place))
 
 
-def read(
-    folder: Path,
-    *,
-    hold_out: str = PUBLISHED_SPLIT,
-    bounds: tuple[float, float] = BOUNDS,
-    encoding: str = "srgb",
-) -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene.
 
     Args:
         folder: Holds what the module describes.
-        hold_out: Which frames to hold out.
-        bounds: Nearest and farthest depth, in metres.
-        encoding: How stored values relate to light.
+        options: `hold_out`.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -93,11 +85,9 @@ def read(
     )
     made = rgbd_capture(
         frames,
-        lambda count: split_by_rule(count, hold_out),
+        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
         folder=folder,
         source="scannet",
-        bounds=bounds,
-        encoding=encoding,
         points=_mesh(folder),
     )
     return _with_truth(made, place, np.flatnonzero(usable_poses(frames.poses)))
@@ -171,3 +161,6 @@ def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> 
     if (place / TRUTH / BLUR).is_file():
         frames = replace(frames, blur_px=read_matrix(place / TRUTH / BLUR)[kept, 0])
     return replace(capture, frames=frames)
+
+
+LAYOUT = Layout("scannet", recognise, read, "color/, pose/ and intrinsic/intrinsic_color.txt")

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8, UInt16
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import RgbdFrames, pinhole, rgbd_capture
 from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT
 from sharpfield.core.capture import Capture
@@ -99,13 +100,12 @@ def recognise(folder: Path) -> bool:
     return len(list(folder.glob("*.sens"))) == 1
 
 
-def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb") -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read the recording of a folder.
 
     Args:
         folder: Holds one `.sens` file.
-        hold_out: Which frames to hold out.
-        encoding: How stored values relate to light.
+        options: `hold_out`.
 
     Raises:
         CaptureError: The file is malformed or cut off.
@@ -128,10 +128,9 @@ def read(folder: Path, *, hold_out: str = PUBLISHED_SPLIT, encoding: str = "srgb
     )
     return rgbd_capture(
         frames,
-        lambda count: split_by_rule(count, hold_out),
+        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
         folder=folder,
         source="sens",
-        encoding=encoding,
     )
 
 
@@ -199,3 +198,6 @@ def _index(file: BinaryIO, path: Path) -> SensFile:
 
 def _unpack(file: BinaryIO, layout: str) -> tuple:
     return struct.unpack(layout, file.read(struct.calcsize(layout)))
+
+
+LAYOUT = Layout("sens", recognise, read, "one .sens file")

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt16
 
 from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import RgbdFrames, read_pose, rgbd_capture, usable_poses
 from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT, rgb
 from sharpfield.captures.native.frames import decode_depth
@@ -35,14 +36,14 @@ def recognise(folder: Path) -> bool:
     return any(folder.glob(COLOUR)) or any(folder.glob(f"seq-*/{COLOUR}"))
 
 
-def read(folder: Path, *, encoding: str = "srgb") -> Capture:
+def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a sequence, or a scene of several.
 
     A scene is split by its lists of sequences; without them, one frame in five is learned from.
 
     Args:
         folder: Holds what the module describes.
-        encoding: How stored values relate to light.
+        options: `hold_out`, instead of the lists of sequences.
 
     Raises:
         CaptureError: Something is missing, malformed, or does not fit together.
@@ -70,10 +71,11 @@ def read(folder: Path, *, encoding: str = "srgb") -> Capture:
     )
     return rgbd_capture(
         frames,
-        lambda count: _split(folder, kept) or split_by_rule(count, PUBLISHED_SPLIT),
+        lambda count: (
+            _split(folder, kept) or split_by_rule(count, options.hold_out or PUBLISHED_SPLIT)
+        ),
         folder=folder,
         source="7-scenes",
-        encoding=encoding,
     )
 
 
@@ -106,3 +108,6 @@ def _sequences(path: Path) -> set[int]:
         return set()
     lines = path.read_text(errors="replace").split()
     return {int(digits) for line in lines if (digits := "".join(filter(str.isdigit, line)))}
+
+
+LAYOUT = Layout("7-scenes", recognise, read, "frame-*.color.png")

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from sharpfield.captures.clocks import expect_overlap
+from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.native.frames import (
     files_of,
     read_depth,
@@ -161,7 +162,7 @@ def expect_poses(capture: Capture, where: object) -> Capture:
     return capture
 
 
-def read_unposed(folder: Path) -> Capture:
+def read_unposed(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a capture, whether its poses are known or not: what comes before training needs none.
 
     Where they are not, `known.poses` is "unknown" and the trajectory is a camera that stands still
@@ -264,3 +265,6 @@ def _expect_version(about: Table) -> None:
             got=f"{found[0]} version {found[1]}",
             do=f"this program reads {FORMAT} version {VERSION}",
         )
+
+
+LAYOUT = Layout("native", recognise, read_unposed, "capture.toml")

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from sharpfield.captures.read import read_unposed
+from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, calibrate
@@ -65,7 +66,7 @@ def examine(capture: Capture) -> Checkup:
 def examine_path(path: Path, *, layout: str | None = None) -> tuple[Checkup, Capture | None]:
     """Read a capture and look at it; what keeps it from being read is a finding, too."""
     try:
-        capture = read_unposed(path, layout=layout)
+        capture = read_capture(path, ReadOptions(layout=layout), poses=False)
     except CaptureError as error:
         checkup = Checkup(path.resolve().name)
         names = [name for words, name in READ_CHECKS.items() if words in error.what]
