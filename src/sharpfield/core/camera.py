@@ -50,6 +50,11 @@ class Camera:
                 do=f"use one of {', '.join(known)}",
             )
 
+    def __repr__(self) -> str:
+        lens = f", {self.lens} {self.distortion}" if self.distortion else ""
+        focal = f"f {self.fx_px:.4g} {self.fy_px:.4g} px, c {self.cx_px:.4g} {self.cy_px:.4g} px"
+        return f"Camera({self.width}x{self.height}, {focal}{lens})"
+
     @property
     def size(self) -> tuple[int, int]:
         """(width, height) in pixels."""

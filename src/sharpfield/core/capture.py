@@ -105,6 +105,9 @@ class Split:
     train: Int64[np.ndarray, "a"]
     test: Int64[np.ndarray, "b"]
 
+    def __repr__(self) -> str:
+        return f"Split({len(self.train)} to learn from, {len(self.test)} held out)"
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -152,6 +155,11 @@ class Capture:
                 where=self.name,
                 got=f"{len(self.depth)} maps, {len(self.frames or ())} frames",
             )
+
+    def __repr__(self) -> str:
+        parts = [self.frames, self.events, self.depth]
+        held = ", ".join(repr(part) for part in parts if part is not None)
+        return f"Capture({self.name!r}, {self.clock.span_us * 1e-6:.3g} s: {held})"
 
     @cached_property
     def frame_time(self) -> Float[Tensor, "n 2"]:

@@ -38,6 +38,12 @@ class EventStream:
     tracks: int = 1
     """How many tracks there are to tell apart, whether or not their cameras report."""
 
+    def __repr__(self) -> str:
+        span = f", {self.t_us[0]} to {self.t_us[-1]} us" if len(self) else ""
+        tracks = f", {self.tracks} tracks" if self.tracks > 1 else ""
+        kind = f", {self.bayer or 'coloured'}" if self.coloured else ""
+        return f"EventStream({len(self):,} of {self.width}x{self.height}{span}{tracks}{kind})"
+
     def __len__(self) -> int:
         """Number of events."""
         return len(self.t_us)

@@ -49,6 +49,15 @@ class Exposure:
                 do="turn frames and events upside down",
             )
 
+    def __repr__(self) -> str:
+        if not len(self):
+            return "Exposure(0 frames)"
+        short, long = self.duration_us.min(), self.duration_us.max()
+        length = f"{short}" if short == long else f"{short} to {long}"
+        rolling = f", row delay {self.row_delay_us:g} us" if self.row_delay_us else ""
+        span = f"{self.open_us.min()} to {self.close_us.max()}"
+        return f"Exposure({len(self)} frames, {span} us, each {length} us{rolling})"
+
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.open_us)
@@ -128,6 +137,12 @@ class Frames:
         """Number of frames."""
         return len(self.images)
 
+    def __repr__(self) -> str:
+        known = int(self.with_truth.sum())
+        truth = f", {known} with sharp truth" if known else ""
+        kind = f"{self.images.dtype}, {self.channels} channels, {self.encoding}"
+        return f"Frames({len(self)} of {self.width}x{self.height}, {kind}{truth})"
+
     @property
     def height(self) -> int:
         """Image height in pixels."""
@@ -196,6 +211,9 @@ class DepthMaps:
             )
         if not self.unit > 0:
             raise CaptureError("a step of depth must be positive", got=self.unit)
+
+    def __repr__(self) -> str:
+        return f"DepthMaps({len(self)} of {self.camera.width}x{self.camera.height})"
 
     def __len__(self) -> int:
         """Number of maps."""

@@ -23,6 +23,14 @@ class Struct:
     trailing: ClassVar[dict[str, int]] = {}
     """Trailing axes of each field that has any; fields not named here have none."""
 
+    def __init_subclass__(cls) -> None:
+        """Keep the short text below where `dataclass` would write one with all numbers in it."""
+        super().__init_subclass__()
+        cls.__repr__ = Struct.__repr__
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
     def map(self: S, change: Callable[[Tensor, int], Tensor]) -> S:
         """Apply `change(tensor, trailing axes)` to every tensor, also inside nested structs."""
         changed: dict[str, Any] = {}
@@ -91,3 +99,15 @@ class Struct:
     def _fields(self) -> list[tuple[str, Any]]:
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
         return [(field.name, getattr(self, field.name)) for field in fields]
+
+
+def one_line(record: Any) -> str:
+    """A dataclass as text, its arrays and tensors by their shapes alone."""
+    shown = []
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        shape = getattr(value, "shape", None)
+        if value is not None:
+            text = repr(value) if shape is None or isinstance(value, Struct) else str([*shape])
+            shown.append(f"{field.name}={text}")
+    return f"{type(record).__name__}({', '.join(shown)})"

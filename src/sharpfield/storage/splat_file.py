@@ -43,6 +43,9 @@ class SplatTable:
     """Ordered by degree, then by order m from -l to l, see `ops/encoding.py`."""
     comments: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"SplatTable({len(self.means):,} Gaussians, {self.harmonics.shape[1]} harmonics)"
+
 
 def write_splats(path: Path, splats: SplatTable) -> None:
     """Write Gaussians of degree 0 to 3; the file appears whole or not at all."""
