@@ -139,12 +139,14 @@ def usage() -> str:
 
 
 def _as_one_line(usual: Callable[..., None]) -> Callable[..., None]:
-    """Print hints without the place in the code; other warnings as usual."""
+    """Print hints once, without the place in the code; other warnings as usual."""
+    told: set[str] = set()
 
     def show(message: Any, category: type[Warning], *where: Any) -> None:
         if not issubclass(category, Hint):
             usual(message, category, *where)
-            return
-        print(textwrap.shorten(f"note: {message}", 400), file=sys.stderr)
+        elif (text := textwrap.shorten(f"note: {message}", 400)) not in told:
+            told.add(text)
+            print(text, file=sys.stderr)
 
     return show

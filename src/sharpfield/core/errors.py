@@ -54,10 +54,10 @@ class Hint(UserWarning):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """What to do about an unknown name: the known ones like it, or all where none is like it."""
+    """What to do about an unknown name: the known one most like it, or all if none is."""
     names = list(known)
-    if close := get_close_matches(name, names, n=2, cutoff=0.5):
-        return f"did you mean {' or '.join(close)}?"
+    if close := get_close_matches(name, names, n=1, cutoff=0.5):
+        return f"did you mean {close[0]}?"
     return f"use one of {', '.join(names)}" if names else "leave it out: there is none"
 
 
