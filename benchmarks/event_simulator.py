@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import LUMA, SENSORS, EventSensor
 from sharpfield.simulation.sensors.events import EventPixels
-from sharpfield.simulation.simulate import Rig, view
+from sharpfield.simulation.static_capture import Rig, view
 
 SIZE, IMAGES, RUNS = (346, 260), 200, 5
 MS = 1_000_000

@@ -1,4 +1,4 @@
-"""Gaussians drawn in tiles the straightforward way: the opponent of `ops/fast/rasterize.py`.
+"""Gaussians drawn in tiles the straightforward way: the opponent of `ops/fast/rasterizer.py`.
 
 Splats come from the definition's projection. Each is listed, in order of depth, in all tiles that a
 square around it touches; every pixel walks through the list of its tile on its own, forwards until
@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast._kernel import kernel, memory, spread
-from sharpfield.ops.rasterize import FAINTEST, MOST, Canvas, Drawn, project
+from sharpfield.ops.rasterizer import FAINTEST, MOST, Canvas, Drawn, project
 
 TILE = 16
 REACH = 3.33
@@ -27,7 +27,7 @@ ONE, HALF = np.float32(1), np.float32(0.5)
 
 
 def rasterize(*gaussians: Any) -> Drawn:
-    """As `ops.rasterize`, without shifts."""
+    """As `ops.rasterizer`, without shifts."""
     means, quaternions, scales, opacities, colours, poses, canvas = gaussians
     splats = project(means, quaternions, scales, opacities, poses, canvas)
     features = torch.cat([colours, splats.depth[..., None]], -1)

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sharpfield.ops import composite, grid, hash_grid, total_variation
+from sharpfield.ops import compositing, grid, hash_grid, total_variation
 from sharpfield.ops._dispatch import Op, using
 
 RAYS, SAMPLES = 1152, 128
@@ -80,7 +80,7 @@ WORKLOADS: dict[str, tuple[Op[..., Any], Callable[[], tuple[Any, ...]]]] = {
         lambda: (normal(FINE[1], FINE[0], CHANNELS[0]),),
     ),
     "hash grid": (hash_grid.hash_features, hashed),
-    "weights": (composite.weigh, rays),
+    "weights": (compositing.weigh, rays),
 }
 
 

@@ -22,7 +22,7 @@ from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.plan import Options
 
 

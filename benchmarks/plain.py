@@ -28,7 +28,7 @@ from sharpfield.fields.plane_grid import PlaneField
 from sharpfield.formation.adaptive import AdaptiveWeights
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.rigid_kernel import RigidMotions
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.geometry.space import Space
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.ev_deblur_nerf import Model

@@ -24,8 +24,8 @@ from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.cameras.rigs import ring
-from sharpfield.simulation.simulate import Rig, Timing, simulate
-from sharpfield.simulation.simulate_moving import MOVING_RIG, simulate_moving
+from sharpfield.simulation.moving_capture import MOVING_RIG, simulate_moving
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.plan import Options
 
 Size = tuple[int, int]

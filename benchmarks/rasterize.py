@@ -25,7 +25,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import need
 from sharpfield.ops._dispatch import using
-from sharpfield.ops.rasterize import Canvas, rasterize
+from sharpfield.ops.rasterizer import Canvas, rasterize
 
 Scene = tuple[int, tuple[int, int], float, int]
 """How many Gaussians, the size of the image, their scale in px, how many views."""

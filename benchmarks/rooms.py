@@ -25,7 +25,7 @@ from sharpfield.recipes.options import changed
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
-from sharpfield.simulation.simulate_room import ROOM_RIG, RoomTiming, simulate_room
+from sharpfield.simulation.room_capture import ROOM_RIG, RoomTiming, simulate_room
 from sharpfield.training.plan import Options
 
 

@@ -16,7 +16,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, calibrate
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 CLEAN, GRAINY = FrameSensor(), FrameSensor(full_well=8000, read_noise=0.003)
 

@@ -29,7 +29,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
-from sharpfield.simulation.simulate import Rig, simulate
+from sharpfield.simulation.static_capture import Rig, simulate
 from sharpfield.training.memory import available_bytes, kept_bytes
 from sharpfield.training.optim import adam
 

@@ -27,7 +27,7 @@ from sharpfield.geometry.se3 import quaternion_from_rotation
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.recordings.recording import Frame, Recording
 from sharpfield.simulation.sensors.event_pixels import SENSORS
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.evt_writer import writing_evt
 from sharpfield.storage.images import write_image

@@ -17,7 +17,7 @@ from sharpfield.metrics.image import psnr
 from sharpfield.recipes.choose import prepared
 from sharpfield.rendering.view import render_view
 from sharpfield.report.colormaps import eight_bit
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam

@@ -19,7 +19,7 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
 from sharpfield.simulation.scenes.static import Scene, scene
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
 
 FRAME = 1

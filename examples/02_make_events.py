@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 # What records: two sensors behind one lens. Thresholds differ a little from pixel to pixel, and a
 # pixel is blind for 100 us after an event.

@@ -21,7 +21,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.nerf import NeRF, draft
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.hooks import every
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam

@@ -12,7 +12,7 @@ from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from tests.streams import HEIGHT, WIDTH, random_events
 
 SAMPLES = Path(__file__).parents[1].parent / "shared" / "data"

@@ -3,7 +3,7 @@
 A package lists them once, as ordinary imports that only type checkers and editors carry out:
 
     if TYPE_CHECKING:
-        from sharpfield.ops.composite import composite as composite
+        from sharpfield.ops.compositing import composite as composite
 
     __getattr__, __dir__ = lazily(__name__, __file__)
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from benchmarks import naive_tiles
 from benchmarks.rasterize import SCENES, scene
-from sharpfield.ops.rasterize import rasterize
+from sharpfield.ops.rasterizer import rasterize
 
 
 def value_and_gradients(draw, arguments: list) -> list[Tensor]:

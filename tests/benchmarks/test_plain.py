@@ -8,12 +8,12 @@ from benchmarks.plain import Plain
 from benchmarks.plain_field import PlainHead, PlainVolume
 from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import PlaneHead, Volume
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
 from sharpfield.recipes.volume.event_term import EventOptions
 from sharpfield.recipes.volume.frame_terms import FrameOptions
 from sharpfield.recipes.volume.scene import VolumeOptions
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 KERNEL = 1199
 """The first step with everything switched on."""

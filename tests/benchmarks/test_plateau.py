@@ -7,7 +7,7 @@ import pytest
 from benchmarks.plateau import RACES, round_of
 from sharpfield.captures.native import layout as native
 from sharpfield.core.capture import Capture
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from tests.recipes.moving import tiny_moving
 
 

@@ -9,7 +9,7 @@ import torch
 from sharpfield.captures.summary import downscaled
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 
 @pytest.fixture(scope="module")

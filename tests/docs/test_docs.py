@@ -169,7 +169,7 @@ def test_the_tree_of_the_readme_exists() -> None:
 
 
 def test_files_named_in_tables_exist() -> None:
-    """Paths such as `formation/mix.py` in backticks, from the package, or from the top."""
+    """Paths such as `formation/mixing.py` in backticks, from the package, or from the top."""
     places = (ROOT, ROOT / "src" / "sharpfield", ROOT / "src" / "sharpfield" / "recipes")
     for page in PAGES:
         for path in re.findall(r"`([a-z_]+(?:/[a-z_0-9]+)*\.py)\b", page.read_text()):

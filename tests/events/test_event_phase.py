@@ -9,10 +9,10 @@ from sharpfield.events.counts import counts_between
 from sharpfield.events.index import build
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import FALL_US, LONGEST_US, OVERSHOOT, phase_at
-from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate, view
+from sharpfield.simulation.static_capture import Rig, Timing, simulate, view
 from sharpfield.storage.event_cache import event_index
 
 SIZE = {"width": 3, "height": 1}

@@ -12,10 +12,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
 from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
-from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate, view
+from sharpfield.simulation.static_capture import Rig, Timing, simulate, view
 
 THRESHOLD = 0.04
 BELIEF = SensorEstimate(THRESHOLD, THRESHOLD)

@@ -11,7 +11,7 @@ from sharpfield.events.index import EventIndex, build
 from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import OVERSHOOT, RAMP_US, ramp_at, ramped_log_mean
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.event_cache import event_index
 
 SIZE = (2, 1)

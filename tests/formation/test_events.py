@@ -4,7 +4,7 @@ import torch
 from sharpfield.core.protocols import Formation
 from sharpfield.core.tone import gamma
 from sharpfield.formation.events import ChainedContrast, LogContrast
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mixing import mix
 from sharpfield.formation.response import FixedResponse, LearnedResponse
 from tests.formation.toy import CAMERA, chains, lit, pairs, swaying, wall
 

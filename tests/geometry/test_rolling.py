@@ -9,7 +9,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.geometry import se3
 from sharpfield.geometry.rolling import KNOTS, Rolling, moved_rows
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 DELAY_US = 400.0
 

@@ -6,7 +6,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.initialisation.posed_images import Images, sharp_images
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 THRESHOLDS = FixedThresholds(0.2, 0.2)
 """Of the simulation."""

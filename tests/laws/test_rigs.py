@@ -10,10 +10,10 @@ from sharpfield.captures.read import read_capture
 from sharpfield.captures.writers import evdnerf as write_evdnerf
 from sharpfield.events.index import build, signed_sum
 from sharpfield.simulation.cameras.rigs import RING_FOCAL, ring
+from sharpfield.simulation.moving_capture import simulate_moving
 from sharpfield.simulation.scenes.moving import moving_scene
 from sharpfield.simulation.scenes.static import Scene
-from sharpfield.simulation.simulate import Rig, Timing
-from sharpfield.simulation.simulate_moving import simulate_moving
+from sharpfield.simulation.static_capture import Rig, Timing
 
 RIG = Rig((24, 24), focal_of_width=RING_FOCAL)
 TIMING = Timing(frames=5, exposure_us=0, interval_us=40_000, step_us=2_000, test_every=2)

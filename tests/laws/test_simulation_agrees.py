@@ -23,7 +23,7 @@ from sharpfield.losses.photometric import mse
 from sharpfield.sampling.pixels_and_pairs import draw_pairs, draw_pixels, pair_table, pixel_table
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 SENSOR = EventSensor(threshold_on=0.25, threshold_off=0.15)
 RIG = Rig(size=(30, 20), event_sensor=SENSOR)

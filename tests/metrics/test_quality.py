@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.metrics.event_blur import event_blur
+from sharpfield.metrics.blur_from_events import event_blur
 from sharpfield.metrics.quality import (
     Comparison,
     bending,
     chained,
     compared,
     event_quality,
+    frame_quality,
     laplacian,
-    quality,
     quality_weights,
     reconciled,
     window_weights,
 )
 from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
 from sharpfield.preparation.quality import rank_correlation
-from sharpfield.simulation.simulate import Rig
-from sharpfield.simulation.simulate_room import RoomTiming, simulate_room
+from sharpfield.simulation.room_capture import RoomTiming, simulate_room
+from sharpfield.simulation.static_capture import Rig
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_nothing_in_common_counts_nothing():
 
 @pytest.fixture(scope="module")
 def by_depth(walked):
-    return quality(walked)
+    return frame_quality(walked)
 
 
 @pytest.fixture(scope="module")
@@ -152,11 +152,11 @@ def test_weights_are_of_all_frames_and_say_nothing_about_held_out_ones(
 
 
 def test_the_published_way_is_the_chain_of_neighbours(walked):
-    found = quality(walked, way="published", overlap="flow")
+    found = frame_quality(walked, way="published", overlap="flow")
     assert len(found.scores) == len(walked.split.train) and (found.scores > 0).all()
     halved = replace(walked.frames, images=walked.frames.images // 2)
-    dimmer = quality(replace(walked, frames=halved), way="published", overlap="depth")
-    whole = quality(walked, way="published", overlap="depth")
+    dimmer = frame_quality(replace(walked, frames=halved), way="published", overlap="depth")
+    whole = frame_quality(walked, way="published", overlap="depth")
     np.testing.assert_allclose(dimmer.weights, whole.weights, rtol=0.2)
 
 
@@ -164,7 +164,7 @@ def test_only_a_few_images_are_held_at_once(walked):
     """However long the video: 18 images of 640x480 with their responses are 49 MB."""
     for way in ("reconciled", "published"):
         tracemalloc.start()
-        quality(walked, way=way, overlap="depth")
+        frame_quality(walked, way=way, overlap="depth")
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert peak < 36e6
@@ -172,6 +172,6 @@ def test_only_a_few_images_are_held_at_once(walked):
 
 def test_errors_say_what_is_missing(walked):
     with pytest.raises(OptionError, match="the capture has no depth"):
-        quality(replace(walked, depth=None), overlap="depth")
+        frame_quality(replace(walked, depth=None), overlap="depth")
     with pytest.raises(CaptureError, match="this needs events, and the capture has none"):
         event_quality(walked.without(events=True))

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from sharpfield.core.errors import MissingExtra, OptionError
 from sharpfield.ops import _dispatch
-from sharpfield.ops import rasterize as definition
+from sharpfield.ops import rasterizer as definition
 from sharpfield.ops._dispatch import using
-from sharpfield.ops.rasterize import WIDEN, Canvas, Splats, rasterize
+from sharpfield.ops.rasterizer import WIDEN, Canvas, Splats, rasterize
 from tests.ops.test_rasterize import CAMERA, scene
 
 POSES = torch.eye(3, 4).repeat(2, 1, 1)

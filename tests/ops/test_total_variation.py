@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sharpfield.ops._dispatch import using
-from sharpfield.ops.total_variation import total_variation
+from sharpfield.ops.grid import total_variation
 
 
 @pytest.fixture(params=["reference", "fast"], autouse=True)

@@ -5,7 +5,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.preparation.quality import blur_images
-from sharpfield.simulation.sensors.motion_kernel import KernelRange
+from sharpfield.simulation.sensors.motion_blur import KernelRange
 from sharpfield.storage.images import read_image, write_image
 
 

@@ -17,7 +17,7 @@ from sharpfield.events.motion import EventMotion
 from sharpfield.preparation.deblur import DeblurOptions, deblur, deblur_to
 from sharpfield.preparation.thresholds import find_thresholds
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.images import read_image
 
 THRESHOLD = 0.2

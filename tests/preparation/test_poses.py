@@ -25,8 +25,8 @@ from sharpfield.preparation.poses.find import PoseOptions, PosesFound, find_pose
 from sharpfield.preparation.poses.images import sharp_images
 from sharpfield.preparation.poses.path import carried_on
 from sharpfield.preparation.poses.report import as_text, summary
-from sharpfield.simulation.cameras.motion import motion
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.cameras.motions import motion
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 BLURBALL = Path(__file__).parents[2].parent / "shared" / "data" / "posed" / "deblurnerf_blurball"
 

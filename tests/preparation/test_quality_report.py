@@ -14,8 +14,8 @@ from sharpfield.preparation.quality import (
     quality_to,
     rank_correlation,
 )
-from sharpfield.simulation.simulate import Rig
-from sharpfield.simulation.simulate_room import RoomTiming, simulate_room
+from sharpfield.simulation.room_capture import RoomTiming, simulate_room
+from sharpfield.simulation.static_capture import Rig
 from sharpfield.storage.images import read_image
 
 

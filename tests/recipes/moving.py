@@ -5,7 +5,7 @@ from functools import cache
 
 from sharpfield.core.capture import Capture
 from sharpfield.simulation.cameras.rigs import ring
-from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
+from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
 
 
 @cache

@@ -12,7 +12,7 @@ from sharpfield.initialisation.visual_hull import hull, silhouettes
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
 from sharpfield.recipes.volume.voxel_scene import MovingOptions
 from sharpfield.simulation.cameras.rigs import hand_held, ring
-from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
+from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
 from sharpfield.storage.event_cache import event_index
 from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving

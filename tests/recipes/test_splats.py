@@ -15,7 +15,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.measurements import Instants, Pixels
 from sharpfield.core.protocols import Growing, Model
 from sharpfield.core.rays import Rays, Views
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mixing import mix
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.geometry.trajectory import Still
 from sharpfield.recipes import RECIPES, recipe_named
@@ -26,7 +26,7 @@ from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
 from sharpfield.sampling.views import SamplingOptions
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.geometry.space import Frustum, Metric
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
-from sharpfield.rendering.gather import Compositing
+from sharpfield.rendering.head_compositing import Compositing
 
 CAMERA = Camera(8, 6, 9.0, 9.0, 4.0, 3.0)
 DENSITY, BEGIN, END = 2.0, 1.5, 2.2

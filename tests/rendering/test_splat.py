@@ -11,7 +11,7 @@ from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
 from sharpfield.fields.gaussians.static import Gaussians
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mixing import mix
 from sharpfield.formation.shutter import Shutter
 from sharpfield.geometry import se3
 from sharpfield.rendering.splat import Cloud, Splatting, whole
@@ -129,7 +129,7 @@ def test_thin_splats_are_fainter_when_antialiased():
 
 
 def test_a_blurred_frame_is_the_mean_of_its_views():
-    """The formula of `formation.mix`, by hand."""
+    """The formula of `formation.mixing`, by hand."""
     scene, pose = cloud(), poses(2, 5)
     blurred = mix(splatting()(scene, views(pose)), outer=TONE.encode)
     for m in range(2):

@@ -11,7 +11,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.tone import tone_of
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry import se3
-from sharpfield.ops.rasterize import Drawn
+from sharpfield.ops.rasterizer import Drawn
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.splat_lens import STEEPEST, flattened, resampled
 

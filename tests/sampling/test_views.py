@@ -14,7 +14,7 @@ from sharpfield.events.latent_frames import SensorEstimate
 from sharpfield.events.ramps import LONGEST_US, phase_at
 from sharpfield.sampling.views import SamplingOptions, ViewSampler
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.event_cache import event_index
 
 BELIEF = SensorEstimate(0.2, 0.2)

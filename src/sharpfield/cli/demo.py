@@ -19,7 +19,7 @@ from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.plan import Options
 
 STRONG_BLUR = Timing(exposure_us=80_000, interval_us=90_000)

@@ -16,7 +16,7 @@ from sharpfield.preparation.quality import (
     judged,
     quality_to,
 )
-from sharpfield.simulation.sensors.motion_kernel import INTENSITY, PROBABILITY, SIZE, KernelRange
+from sharpfield.simulation.sensors.motion_blur import INTENSITY, PROBABILITY, SIZE, KernelRange
 
 JUDGING = QualityOptions()
 SHOWN = 12

@@ -41,7 +41,7 @@ class Radiance(Struct):
     opacity: Float[Tensor, "*b"]
     """How much of the light was stopped by the scene, 0...1."""
     weight: Float[Tensor, "*b"]
-    """The rays' weights, carried along for `formation.mix`."""
+    """The rays' weights, carried along for `formation.mixing`."""
     coarse: "Radiance | None" = None
     """What the coarse head alone would give, where there are two."""
     samples: Samples | None = None
@@ -53,7 +53,7 @@ class Rays(Struct):
     """Where light comes from, when, and how much it counts in its measurement.
 
     The rays that make one measurement lie along the last leading axis, `[..., k]`; their weights
-    ride with them, so that one function (`formation.mix`) can combine them for every sensor.
+    ride with them, so that one function (`formation.mixing`) can combine them for every sensor.
     """
 
     trailing: ClassVar = {"origin": 1, "direction": 1}

@@ -31,7 +31,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.core.seed import numpy_generator
 from sharpfield.evaluation.views import held_out
 from sharpfield.geometry import se3
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics.image import psnr
 from sharpfield.metrics.pose import absolute_error, align, relative_error

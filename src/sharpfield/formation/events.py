@@ -17,8 +17,8 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.measurements import EventPairs
 from sharpfield.core.protocols import Response, Trajectory
 from sharpfield.core.rays import Radiance, Rays
-from sharpfield.formation.mix import mix
-from sharpfield.geometry.cast import cast
+from sharpfield.formation.mixing import mix
+from sharpfield.geometry.rays import cast
 
 
 @dataclass(frozen=True)

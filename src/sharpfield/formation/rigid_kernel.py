@@ -21,9 +21,9 @@ from sharpfield.core.measurements import Pixels
 from sharpfield.core.protocols import Trajectory
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.tone import Curve, identity
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mixing import mix
 from sharpfield.geometry import se3
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.ops.dense import Dense, FrameVectors
 
 ORIGIN = 0

@@ -18,8 +18,8 @@ from sharpfield.core.measurements import Pixels
 from sharpfield.core.protocols import Trajectory
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.tone import Curve, identity
-from sharpfield.formation.mix import mix
-from sharpfield.geometry.cast import cast
+from sharpfield.formation.mixing import mix
+from sharpfield.geometry.rays import cast
 
 
 @dataclass(frozen=True)

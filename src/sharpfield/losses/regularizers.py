@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.ops.total_variation import total_variation
+from sharpfield.ops.grid import total_variation
 
 SMOOTHNESS, OF_PLANES, OF_LINES = 5.0, 1e-2, 1e-3
 

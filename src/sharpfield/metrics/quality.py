@@ -26,8 +26,9 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Frames
-from sharpfield.metrics.event_blur import event_blur
+from sharpfield.metrics.blur_from_events import event_blur
 from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
+from sharpfield.storage.result_cache import kept
 
 WIDTH = 640
 """Images are compared at this width, in px."""
@@ -46,6 +47,9 @@ TINY = 1e-9
 Means = Literal["auto", "depth", "flow"]
 """Where overlaps come from; "auto" takes depth where the capture has it."""
 Way = Literal["reconciled", "published"]
+Judge = Literal["published", "auto", "images", "events"]
+"""What weighs frames: images as published; events where there are any, else images; images; events.
+"""
 Source = Literal["auto", "images", "events"]
 """What tells how sharp a frame is; "auto" takes events where the capture has them."""
 SOFTEST_PX = 0.5
@@ -83,7 +87,7 @@ class Quality:
     weights: Float64[np.ndarray, "m"]
 
 
-def quality(
+def frame_quality(
     capture: Capture,
     *,
     frames: Int64[np.ndarray, "m"] | None = None,
@@ -122,7 +126,7 @@ def quality(
 def event_quality(capture: Capture, *, frames: Int64[np.ndarray, "m"] | None = None) -> Quality:
     """Scores and weights of frames, judged by the events of their exposures.
 
-    A score is one over the blur in px, see `metrics.event_blur`.
+    A score is one over the blur in px, see `metrics.blur_from_events`.
 
     Raises:
         CaptureError: There are no events, or they are of several cameras.
@@ -146,8 +150,33 @@ def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.
     if source == "events" or (source == "auto" and with_events):
         found = event_quality(capture)
     else:
-        found = quality(capture)
+        found = frame_quality(capture)
     weights = np.ones(len(capture.needed_frames))
+    weights[found.frames] = found.weights
+    return weights
+
+
+def frame_weights(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
+    """A weight for each frame: about 1 on average over those learned from, and 1 for the others.
+
+    Weights that come from images take long for long captures and are cached on disk.
+
+    Raises:
+        CaptureError: `judge` is "events", and there are none.
+    """
+    by_events = capture.events is not None and capture.events.track is None
+    if judge == "events" or (judge == "auto" and by_events):
+        return quality_weights(capture, source="events")
+    return kept(capture, "quality", {"judge": judge}, lambda: {"weights": _seen(capture, judge)})[
+        "weights"
+    ]
+
+
+def _seen(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
+    if judge != "published":
+        return quality_weights(capture, source="images")
+    weights = np.ones(len(capture.needed_frames))
+    found = frame_quality(capture, way="published")
     weights[found.frames] = found.weights
     return weights
 

@@ -1,4 +1,4 @@
-"""Features looked up in planes and lines that factor a volume.
+"""Features looked up in planes and lines that factor a volume, and their total variation.
 
 Vocabulary: a *plane* `[h, w, c]` and a *line* `[l, c]` hold features at their cells, channels last,
 so that the features of a cell lie side by side in memory. A *volume* is three pairs, each the
@@ -132,3 +132,25 @@ def _features_example(generator: torch.Generator, size: int) -> tuple[object, ..
 def _mixture_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
     points, planes, lines = _example_volume(generator, size)
     return points, planes, lines, torch.randn(64, 8, generator=generator)
+
+
+@Op
+def total_variation(grid: Float[Tensor, "*size c"]) -> Float[Tensor, ""]:
+    """Total variation: twice the mean squared difference of neighbours, summed over the axes.
+
+    Args:
+        grid: A plane `[h, w, c]` or a line `[l, c]`, channels last. An axis of one cell has no
+            neighbours and adds nothing.
+
+    Source: TensoRF (ECCV 2022), the regulariser of its planes and lines; PDRF (AAAI 2023).
+    """
+    total = grid.new_zeros(())
+    for axis, cells in enumerate(grid.shape[:-1]):
+        if cells > 1:
+            total = total + 2 * grid.diff(dim=axis).square().mean()
+    return total
+
+
+@total_variation.exemplify
+def _variation_example(generator: torch.Generator, size: int) -> tuple[Float[Tensor, "h w c"]]:
+    return (torch.randn(7 * size, 5 * size, 6, generator=generator),)

@@ -1,9 +1,9 @@
 """Step functions along a ray: where to look next, given where the light came from.
 
 Vocabulary: `depth [*b s]` are points of a ray in ascending order; `edges [*b s+1]` bound s
-intervals; `weights [*b s]` are the shares of the ray's light, see `ops.composite`. A *position* is
-a number 0 to 1 that says how far along the cumulative weight a new sample lies. New samples carry
-no gradient: they say where to look, and looking elsewhere is not how the light is explained.
+intervals; `weights [*b s]` are the shares of the ray's light, see `ops.compositing`. A *position*
+is a quantile, 0 to 1, of the cumulative weight at which a new sample is placed. New samples carry
+no gradient: they must not move to change the rendered light.
 
 Source: NeRF (ECCV 2020), section 5.2.
 """

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from sharpfield.core.errors import ShapeError
 from sharpfield.ops._dispatch import Op
-from sharpfield.ops.composite import gather, weights_of_opacities
+from sharpfield.ops.compositing import gather, weights_of_opacities
 
 DENSITY_SHIFT = -4.6
 """Added to raw density, so that an untrained grid absorbs about 1 % of the light per step."""

@@ -15,8 +15,8 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.files import replacing, replacing_folder, write_json
 from sharpfield.core.seed import numpy_generator
-from sharpfield.metrics.quality import Means, Quality, Way, event_quality, quality
-from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
+from sharpfield.metrics.quality import Means, Quality, Way, event_quality, frame_quality
+from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.storage.images import list_images, read_image, write_image
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
     if options.source == "events" or (options.source == "auto" and single):
         return event_quality(capture, frames=frames), "events"
     by_depth = capture.depth is not None and options.overlap != "flow"
-    found = quality(capture, frames=frames, overlap=options.overlap, way=options.way)
+    found = frame_quality(capture, frames=frames, overlap=options.overlap, way=options.way)
     return found, "depth" if by_depth else "flow"
 
 

@@ -22,7 +22,7 @@ from sharpfield.formation.patch_kernel import (
     LearnedKernel,
     motion_kernels,
 )
-from sharpfield.metrics.frame_weights import Judge, frame_weights
+from sharpfield.metrics.quality import Judge, frame_weights
 from sharpfield.recipes import point_nerf
 from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.point_nerf import PointNeRF

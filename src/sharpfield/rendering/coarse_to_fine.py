@@ -14,7 +14,7 @@ from sharpfield.core.protocols import Field
 from sharpfield.core.rays import Radiance, Rays, Samples
 from sharpfield.geometry.space import Space
 from sharpfield.ops import stepfun
-from sharpfield.rendering.gather import Compositing, Work, gather
+from sharpfield.rendering.head_compositing import Compositing, Work, composite_head
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class CoarseToFine:
         work = Work(
             looked, at(z), z, length, rays.direction, noise=self._noise(z.shape, generator, rays)
         )
-        coarse = gather(self.field.coarse, work, self.how)
+        coarse = composite_head(self.field.coarse, work, self.how)
 
         more = stepfun.resample_points(z, coarse.weights.detach(), self._positions(rays, generator))
         both, order = stepfun.merge(z, more)
@@ -65,7 +65,7 @@ class CoarseToFine:
             order=order,
             noise=self._noise(both.shape, generator, rays),
         )
-        fine = gather(self.field.fine, work, self.how, keep_feature=samples)
+        fine = composite_head(self.field.fine, work, self.how, keep_feature=samples)
         return Radiance(
             fine.rgb,
             fine.depth,

@@ -19,7 +19,7 @@ from torch import Generator, Tensor
 
 from sharpfield.core.rays import Rays
 from sharpfield.core.struct import Struct
-from sharpfield.ops import composite
+from sharpfield.ops import compositing
 
 UNSEEN = 1e-4
 """In evaluation, colour is left out where a sample's share of the light is below this."""
@@ -153,7 +153,7 @@ class PointMarch:
         density, hidden = self.points.density(rows, way, direction[ray], of_place)
         spread = density.new_zeros(which.numel()).index_copy(0, asked, density)
         spread = spread.view(which.shape)
-        weights = composite.weigh(spread, torch.full_like(spread, self.thickness))
+        weights = compositing.weigh(spread, torch.full_like(spread, self.thickness))
         share = weights.flatten()[asked]
         seen = torch.nonzero(share > (SPECK if torch.is_grad_enabled() else UNSEEN))[:, 0]
         at = asked[seen]
@@ -168,7 +168,7 @@ class PointMarch:
             )
         )
         opacity = weights.sum(-1)
-        mixed = composite.gather_kept(weights, at, light)
+        mixed = compositing.gather_kept(weights, at, light)
         hit = torch.zeros_like(opacity, dtype=torch.bool).index_fill(0, ray, True)
         densest, best = spread.detach().max(-1)
         return Met(

@@ -16,7 +16,7 @@ from torch import Tensor
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import need
 from sharpfield.core.rays import Radiance, Views
-from sharpfield.ops.rasterize import Canvas, rasterize
+from sharpfield.ops.rasterizer import Canvas, rasterize
 from sharpfield.rendering.splat_lens import flattened, resampled
 from sharpfield.rendering.splat_rolling import row_shift
 
@@ -69,7 +69,7 @@ class Splatting:
         Args:
             cloud: What is drawn.
             views: `[m, k]`: the k views that explain each of m measurements.
-            shift: Moves splats in pixels, see `ops.rasterize`; v = m k.
+            shift: Moves splats in pixels, see `ops.rasterizer`; v = m k.
 
         Returns:
             Radiance `[m, h, w, k]`.

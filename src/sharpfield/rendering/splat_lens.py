@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import OptionError
-from sharpfield.ops.rasterize import Canvas, Drawn
+from sharpfield.ops.rasterizer import Canvas, Drawn
 
 STEEPEST = 5.0
 """Largest distance from the optical axis on the plane z = 1 that is drawn: 79 degrees."""

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sharpfield.core.camera import Camera
-from sharpfield.ops.rasterize import NEAR
+from sharpfield.ops.rasterizer import NEAR
 
 ROUNDS = 2
 """Each leaves a part of the error that is about the image's motion over the readout, in images."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Radiance, Rays, Views
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.rendering.splat import whole
 
 CHUNK = 4096

@@ -8,17 +8,17 @@ from typing import Any, Literal
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, did_you_mean
-from sharpfield.simulation.cameras.motion import MOTIONS
+from sharpfield.simulation.cameras.motions import MOTIONS
 from sharpfield.simulation.cameras.rigs import Views, hand_held, ring
+from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
+from sharpfield.simulation.room_capture import ROOM_RIG, RoomSensors, RoomTiming, simulate_room
 from sharpfield.simulation.scenes.moving import MOVING_SCENES
 from sharpfield.simulation.scenes.static import SCENES
 from sharpfield.simulation.sensors.depth import DepthSensor
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing
-from sharpfield.simulation.simulate import simulate as simulate_still
-from sharpfield.simulation.simulate_moving import MOVING_RIG, MOVING_TIMING, simulate_moving
-from sharpfield.simulation.simulate_room import ROOM_RIG, RoomSensors, RoomTiming, simulate_room
+from sharpfield.simulation.static_capture import Rig, Timing
+from sharpfield.simulation.static_capture import simulate as simulate_still
 
 ROOM = "room"
 STILL_SIZE, MOVING_SIZE, ROOM_SIZE = (240, 160), (64, 64), (240, 180)

@@ -20,7 +20,7 @@ from sharpfield.core.frames import Exposure
 from sharpfield.geometry.trajectory import Still
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor, decode
-from sharpfield.simulation.simulate import Recorder
+from sharpfield.simulation.static_capture import Recorder
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 """Endings of image files."""

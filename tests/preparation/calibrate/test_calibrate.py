@@ -12,7 +12,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, Calibration, calibrate
 from sharpfield.preparation.calibrate.report import as_text, write_calibration
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.arrays import load_arrays
 
 ON, OFF = 0.25, 0.3

@@ -20,7 +20,7 @@ from sharpfield.preparation.doctor.events import check_light, odd_pixels
 from sharpfield.preparation.doctor.findings import Checkup
 from sharpfield.preparation.poses.path import frames_of
 from sharpfield.simulation.sensors.event_pixels import SENSORS
-from sharpfield.simulation.simulate import Rig, Timing, simulate
+from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 
 @lru_cache

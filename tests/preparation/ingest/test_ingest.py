@@ -22,8 +22,8 @@ from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import open_recording
 from sharpfield.recordings.recording import Frame, Recording, Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.simulate import Rig, simulate
-from sharpfield.simulation.simulate import Timing as Exposures
+from sharpfield.simulation.static_capture import Rig, simulate
+from sharpfield.simulation.static_capture import Timing as Exposures
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
 from tests.recordings.aedat.aedat4_writer import write_aedat4

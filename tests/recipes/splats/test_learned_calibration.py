@@ -11,7 +11,7 @@ from sharpfield.core.capture import Capture, Known, Thresholds
 from sharpfield.core.measurements import Batch, EventPairs, Instants, Pixels
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.events.threshold import LearnedThresholds
-from sharpfield.formation.mix import mix
+from sharpfield.formation.mixing import mix
 from sharpfield.geometry.trajectory import LearnedExposureMotion, LearnedKnots, Still
 from sharpfield.recipes.splat import EvSplat
 from sharpfield.recipes.splats.learned_calibration import (

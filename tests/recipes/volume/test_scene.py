@@ -8,7 +8,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.schedule import constant
 from sharpfield.core.seed import generator
 from sharpfield.geometry import se3
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.geometry.space import Frustum, Metric, average_pose
 from sharpfield.geometry.trajectory import Still
 from sharpfield.recipes.volume.scene import Volume, VolumeOptions, stages

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.cameras.motion import motion
+from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.cameras.rigs import (
     CarriedCamera,
     StillCamera,

@@ -3,12 +3,12 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.simulation.cameras.motion import Motion, motion
+from sharpfield.simulation.cameras.motions import Motion, motion
 from sharpfield.simulation.cameras.rigs import CarriedCamera, StillCamera, ring_pose
 from sharpfield.simulation.scenes.flow import depth_and_flow
 from sharpfield.simulation.scenes.moving import MOVING_SCENES, moving_scene
 from sharpfield.simulation.scenes.static import scene
-from sharpfield.simulation.simulate import Rig, view
+from sharpfield.simulation.static_capture import Rig, view
 
 CAMERA = Camera(64, 64, 89.0, 89.0, 32.0, 32.0)
 RING = StillCamera(ring_pose(-90))

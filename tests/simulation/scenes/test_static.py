@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.cameras.motion import MOTIONS, motion
+from sharpfield.simulation.cameras.motions import MOTIONS, motion
 from sharpfield.simulation.scenes.building import Paint, ball, box, build, rectangle
 from sharpfield.simulation.scenes.static import SCENES, Scene, scene
 from sharpfield.simulation.scenes.surfaces import DARKEST
 from sharpfield.simulation.scenes.textures import BRICKS, CHECKS, LEAVES, STRIPES, TILES, page
-from sharpfield.simulation.simulate import Rig, view
+from sharpfield.simulation.static_capture import Rig, view
 
 HOME = np.eye(3, 4)
 SMALL = Rig((96, 64)).camera()

@@ -22,7 +22,7 @@ from sharpfield.ops.fast._lanes import (
     where_least,
     zeros,
 )
-from sharpfield.ops.rasterize import FAINTEST, MOST
+from sharpfield.ops.rasterizer import FAINTEST, MOST
 
 TILE = 16
 """Rows and columns of a tile."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from sharpfield.ops.fast._kernel import kernel, share
 from sharpfield.ops.fast._splat_blend import GEOMETRY, TILE
-from sharpfield.ops.rasterize import FAINTEST, NEAR, WIDEN
+from sharpfield.ops.rasterizer import FAINTEST, NEAR, WIDEN
 
 CHUNK = 512
 """Gaussians whose gradients for the poses are added up on their own; a constant, so that sums do

@@ -20,7 +20,7 @@ from sharpfield.core.seed import numpy_generator
 from sharpfield.fields.points.cloud import LEAST_CONFIDENCE, NeuralPoints
 from sharpfield.fields.points.networks import shares
 from sharpfield.formation.shutter import Pinhole
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from sharpfield.recipes.points.scene import PointScene
 
 DIFFERENT = 0.002

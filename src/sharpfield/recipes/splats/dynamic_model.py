@@ -17,7 +17,7 @@ from sharpfield.core.protocols import PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
 from sharpfield.core.tone import luma, tone_of
-from sharpfield.formation.mix import mix, mix_of_few
+from sharpfield.formation.mixing import mix, mix_of_few
 from sharpfield.geometry.normalise import centred
 from sharpfield.losses.event_counts import event_terms
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions, DynamicScene

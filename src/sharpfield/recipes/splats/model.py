@@ -25,12 +25,12 @@ from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
 from sharpfield.core.tone import tone_of
 from sharpfield.events.counts import on_frame_clock
-from sharpfield.formation.mix import mix, mix_of_few
+from sharpfield.formation.mixing import mix, mix_of_few
 from sharpfield.geometry.normalise import normalised
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.losses.event_counts import event_terms
 from sharpfield.losses.photometric import depth_error
-from sharpfield.metrics.frame_weights import frame_weights
+from sharpfield.metrics.quality import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (
     LearnedCalibration,
     LearnedCalibrationOptions,

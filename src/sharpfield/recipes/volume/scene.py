@@ -19,9 +19,9 @@ from sharpfield.fields.voxels import VoxelField, shapes_in
 from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
 from sharpfield.losses.regularizers import smoothness
-from sharpfield.ops.total_variation import total_variation
+from sharpfield.ops.grid import total_variation
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
-from sharpfield.rendering.gather import Compositing
+from sharpfield.rendering.head_compositing import Compositing
 from sharpfield.rendering.voxels import EvenSteps
 
 MOST_CELLS = 4_000_000

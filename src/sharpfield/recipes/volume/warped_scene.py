@@ -20,7 +20,7 @@ from sharpfield.fields.warp import AtZero, Deformation, Warped
 from sharpfield.geometry.space import Metric
 from sharpfield.recipes.volume.scene import soft
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
-from sharpfield.rendering.gather import Compositing
+from sharpfield.rendering.head_compositing import Compositing
 
 ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "sigmoid": torch.sigmoid,

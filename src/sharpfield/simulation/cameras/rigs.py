@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 
 from sharpfield.core.errors import OptionError
 from sharpfield.geometry import se3
-from sharpfield.simulation.cameras.motion import CameraPath, Motion, motion
+from sharpfield.simulation.cameras.motions import CameraPath, Motion, motion
 from sharpfield.simulation.scenes.building import Real
 
 RADIUS, ELEVATION_DEG = 4.0, 30.0

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32, Float64
 
 from sharpfield.core.camera import Camera
-from sharpfield.simulation.cameras.motion import CameraPath
+from sharpfield.simulation.cameras.motions import CameraPath
 from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.scenes.surfaces import meet
 

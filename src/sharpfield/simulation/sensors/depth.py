@@ -22,7 +22,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import DepthMaps
 from sharpfield.core.seed import numpy_generator
 from sharpfield.geometry import se3
-from sharpfield.simulation.cameras.motion import CameraPath, Motion
+from sharpfield.simulation.cameras.motions import CameraPath, Motion
 
 BLOTCH_PX = 3
 """Noise of neighbours is alike: it is averaged over so many pixels a side."""

@@ -5,11 +5,11 @@ import pytest
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import checked
-from sharpfield.simulation.cameras.motion import Motion, motion
+from sharpfield.simulation.cameras.motions import Motion, motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import LUMA, EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.simulate import Rig, Timing, images, simulate, view
+from sharpfield.simulation.static_capture import Rig, Timing, images, simulate, view
 
 RIG = Rig((48, 32))
 SHORT = Timing(frames=9, exposure_us=20_000, interval_us=25_000, step_us=2500)

@@ -2,7 +2,7 @@ import torch
 
 from sharpfield.core.camera import Camera
 from sharpfield.geometry import se3
-from sharpfield.geometry.cast import cast
+from sharpfield.geometry.rays import cast
 from tests.geometry.toy import points, poses
 
 CAMERA = Camera(64, 48, 40.0, 41.0, 31.0, 24.5, "brown", (0.1, 0.02, -2e-3, 1e-3, 0.0))

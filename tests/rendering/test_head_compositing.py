@@ -7,8 +7,8 @@ from torch import Tensor
 from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import HeadSize, PlaneHead
 from sharpfield.ops.encoding import frequencies
-from sharpfield.rendering import gather as module
-from sharpfield.rendering.gather import Compositing, Found, Work, gather
+from sharpfield.rendering import head_compositing as module
+from sharpfield.rendering.head_compositing import Compositing, Found, Work, composite_head
 
 RAYS, SAMPLES, LOOKED = 11, 24, 5
 HOWS = {
@@ -98,10 +98,10 @@ def test_it_is_the_plain_formulation(how: Compositing, chunk: int, noisy: bool, 
     """In values and in the gradients of everything that learns."""
     monkeypatch.setitem(module.CHUNK, "cpu", chunk)
     results = []
-    for render in (plain, gather):
+    for render in (plain, composite_head):
         network, given = head(), work(noisy=noisy)
         looked = given.looked.requires_grad_()
-        more = {"keep_feature": True} if render is gather else {}
+        more = {"keep_feature": True} if render is composite_head else {}
         found = render(network, given, how, **more)
         gradients = torch.autograd.grad(pulled(found), [looked, *network.parameters()])
         results.append((found, gradients))
@@ -116,7 +116,7 @@ def test_it_is_the_plain_formulation(how: Compositing, chunk: int, noisy: bool, 
 def test_points_in_order_need_no_order(how: Compositing):
     given = work(ordered=True)
     same = dataclasses.replace(given, order=torch.arange(SAMPLES).expand(RAYS, SAMPLES))
-    found, wanted = gather(head(), given, how), gather(head(), same, how)
+    found, wanted = composite_head(head(), given, how), composite_head(head(), same, how)
     torch.testing.assert_close(found.rgb, wanted.rgb)
     torch.testing.assert_close(found.weights, wanted.weights)
 
@@ -127,9 +127,9 @@ def test_colours_left_out_in_evaluation_do_not_show(how: Compositing, chunk: int
     monkeypatch.setitem(module.CHUNK, "cpu", chunk)
     network, given = head(), work()
     given = dataclasses.replace(given, length=40 * given.length)
-    full = gather(network, given, how, keep_feature=True)
+    full = composite_head(network, given, how, keep_feature=True)
     with torch.no_grad():
-        seen = gather(network, given, how, keep_feature=True)
+        seen = composite_head(network, given, how, keep_feature=True)
     dim = (full.weights > 0) & (full.weights < module.UNSEEN)
     assert dim.any(), "there must be something to leave out"
     torch.testing.assert_close(seen.rgb, full.rgb, rtol=0, atol=1e-3)
@@ -146,7 +146,7 @@ def test_training_asks_for_the_colour_of_lit_points_only(monkeypatch):
     monkeypatch.setattr(
         network, "colour", lambda feature, seen: asked.append(len(feature)) or colour(feature, seen)
     )
-    found = gather(network, given, HOWS["frustum"])
+    found = composite_head(network, given, HOWS["frustum"])
     lit = int((found.weights > module.SPECK).sum())
     assert lit <= sum(asked) < lit + 8 < 0.9 * RAYS * SAMPLES
 
@@ -154,8 +154,8 @@ def test_training_asks_for_the_colour_of_lit_points_only(monkeypatch):
 @pytest.mark.parametrize("seeing", [torch.no_grad, torch.enable_grad])
 def test_an_opaque_end_stops_all_light(seeing):
     with seeing():
-        found = gather(head(), work(), HOWS["frustum"])
-        open_end = gather(head(), work(), HOWS["cleared"])
+        found = composite_head(head(), work(), HOWS["frustum"])
+        open_end = composite_head(head(), work(), HOWS["cleared"])
     torch.testing.assert_close(found.opacity, torch.ones(RAYS))
     assert (open_end.opacity < 0.999).any()
 
@@ -164,7 +164,10 @@ def test_an_opaque_end_stops_all_light(seeing):
 def test_nothing_is_seen_before_the_clear_part_ends(seeing):
     given, how = work(), Compositing(clear_before=0.4)
     with seeing():
-        found, all_of_it = gather(head(), given, how), gather(head(), given, Compositing())
+        found, all_of_it = (
+            composite_head(head(), given, how),
+            composite_head(head(), given, Compositing()),
+        )
     following = torch.cat([given.z[:, 1:], given.z[:, -1:]], -1)
     assert not found.weights[following <= 0.4].any()
     assert all_of_it.weights[following <= 0.4].any()
@@ -178,17 +181,17 @@ def test_behind_nothing_is_the_background():
     how = Compositing(opaque_end=False, background=0.7)
     for seeing in (torch.no_grad, torch.enable_grad):
         with seeing():
-            found = gather(network, work(), how)
+            found = composite_head(network, work(), how)
         torch.testing.assert_close(found.rgb, torch.full((RAYS, 3), 0.7))
         assert not found.opacity.any()
 
 
 def test_features_come_only_when_asked_for():
-    assert gather(head(), work(), Compositing()).feature is None
+    assert composite_head(head(), work(), Compositing()).feature is None
 
 
 @pytest.mark.parametrize("seeing", [torch.no_grad, torch.enable_grad])
 def test_no_rays(seeing):
     with seeing():
-        found = gather(head(), work(0), Compositing())
+        found = composite_head(head(), work(0), Compositing())
     assert found.rgb.shape == (0, 3) and found.weights.shape == (0, SAMPLES)

@@ -1,7 +1,7 @@
 import torch
 
 from sharpfield.core.tone import identity
-from sharpfield.formation.mix import mix, mix_of_few
+from sharpfield.formation.mixing import mix, mix_of_few
 from tests.formation.toy import lit
 
 

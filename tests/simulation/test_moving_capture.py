@@ -16,10 +16,10 @@ from sharpfield.simulation.cameras.rigs import (
     ring,
     ring_pose,
 )
+from sharpfield.simulation.moving_capture import simulate_moving
 from sharpfield.simulation.scenes.moving import ALONE, MOVING_SCENES, moving_scene
 from sharpfield.simulation.sensors.event_pixels import LUMA, EventSensor
-from sharpfield.simulation.simulate import Rig, Timing, view
-from sharpfield.simulation.simulate_moving import simulate_moving
+from sharpfield.simulation.static_capture import Rig, Timing, view
 
 RIG = Rig((32, 32), focal_of_width=RING_FOCAL)
 SHORT = Timing(frames=5, exposure_us=0, interval_us=30_000, step_us=2500, test_every=2)

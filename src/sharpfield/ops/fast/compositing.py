@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sharpfield.ops.composite import LEAK, weigh
+from sharpfield.ops.compositing import LEAK, weigh
 from sharpfield.ops.fast._kernel import kernel, memory
 
 

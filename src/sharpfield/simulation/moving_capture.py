@@ -17,12 +17,12 @@ from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.protocols import Trajectory
 from sharpfield.core.seed import number
 from sharpfield.geometry.trajectory import Still, Tracks
-from sharpfield.simulation.cameras.motion import CameraPath, stamped
+from sharpfield.simulation.cameras.motions import CameraPath, stamped
 from sharpfield.simulation.cameras.rigs import RING_FOCAL, StillCamera, Views, ring
 from sharpfield.simulation.scenes.flow import depth_and_flow
 from sharpfield.simulation.scenes.moving import moving_scene
 from sharpfield.simulation.scenes.static import Scene
-from sharpfield.simulation.simulate import Rig, Timing, record
+from sharpfield.simulation.static_capture import Rig, Timing, record
 
 MOVING_RIG = Rig(size=(128, 128), focal_of_width=RING_FOCAL)
 MOVING_TIMING = Timing(frames=33, exposure_us=0, interval_us=31_250, step_us=1250, test_every=8)

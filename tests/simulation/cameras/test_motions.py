@@ -4,7 +4,7 @@ import torch
 
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.cameras.motion import MOTIONS, motion, stamped
+from sharpfield.simulation.cameras.motions import MOTIONS, motion, stamped
 
 
 @pytest.mark.parametrize("name", MOTIONS)

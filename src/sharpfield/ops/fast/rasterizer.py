@@ -22,7 +22,7 @@ from sharpfield.core.errors import need
 from sharpfield.ops.fast._kernel import memory, spread
 from sharpfield.ops.fast._splat_blend import GEOMETRY, LANES, TILE, blend, blend_back
 from sharpfield.ops.fast._splat_project import CHUNK, list_touches, project, project_back
-from sharpfield.ops.rasterize import NEAR, WIDEN, Canvas, Drawn, rasterize
+from sharpfield.ops.rasterizer import NEAR, WIDEN, Canvas, Drawn, rasterize
 
 
 @rasterize.accelerate("cpu", needs="numba")

@@ -8,13 +8,13 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Exposure
-from sharpfield.simulation.cameras.motion import exposure_for, instants, travel
-from sharpfield.simulation.cameras.walk import walk
+from sharpfield.simulation.cameras.motions import exposure_for, instants, travel
+from sharpfield.simulation.cameras.room_walk import walk
+from sharpfield.simulation.room_capture import BLURRY_OF_WIDTH, RoomTiming, simulate_room
 from sharpfield.simulation.scenes.building import Paint, build, cylinder
-from sharpfield.simulation.scenes.room import CEILING, FLOOR, ROOM, room
+from sharpfield.simulation.scenes.room_scene import CEILING, FLOOR, ROOM, room
 from sharpfield.simulation.scenes.static import Scene
-from sharpfield.simulation.simulate import Rig, view
-from sharpfield.simulation.simulate_room import BLURRY_OF_WIDTH, RoomTiming, simulate_room
+from sharpfield.simulation.static_capture import Rig, view
 
 SMALL = Rig(size=(64, 48))
 TINY = Rig(size=(32, 24))

@@ -20,15 +20,21 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import MILLIMETRE, DepthMaps, Exposure, Frames
 from sharpfield.core.seed import numpy_generator
-from sharpfield.simulation.cameras.motion import CameraPath, exposure_for, instants, stamped, travel
-from sharpfield.simulation.cameras.walk import walk
-from sharpfield.simulation.scenes.room import room
+from sharpfield.simulation.cameras.motions import (
+    CameraPath,
+    exposure_for,
+    instants,
+    stamped,
+    travel,
+)
+from sharpfield.simulation.cameras.room_walk import walk
+from sharpfield.simulation.scenes.room_scene import room
 from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.sensors.depth import DepthSensor, drifting
 from sharpfield.simulation.sensors.events import EventPixels, Gap, joined
 from sharpfield.simulation.sensors.frames import Exposing, store
-from sharpfield.simulation.sensors.motion_kernel import PUBLISHED, KernelRange, blurred, drawn_blur
-from sharpfield.simulation.simulate import MARGIN_US, Rig, drawn_ahead, view
+from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, blurred, drawn_blur
+from sharpfield.simulation.static_capture import MARGIN_US, Rig, drawn_ahead, view
 
 BLURRY_OF_WIDTH = 0.006
 """A frame counts as blurry when its points travel this share of the image's width: 1.4 px of 240,

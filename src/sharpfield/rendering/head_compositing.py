@@ -20,7 +20,7 @@ from torch.utils.checkpoint import checkpoint
 
 from sharpfield.core.protocols import Head
 from sharpfield.core.struct import Struct
-from sharpfield.ops import composite, stepfun
+from sharpfield.ops import compositing, stepfun
 
 UNSEEN = 1e-4
 """In evaluation, colour is left out where a sample's share of the light is below this."""
@@ -94,7 +94,9 @@ class Known:
     raw: Float[Tensor, "b s"]
 
 
-def gather(head: Head, work: Work, how: Compositing, *, keep_feature: bool = False) -> Found:
+def composite_head(
+    head: Head, work: Work, how: Compositing, *, keep_feature: bool = False
+) -> Found:
     """Density and colour of all points, composited along each ray.
 
     Args:
@@ -187,8 +189,8 @@ def _weights(raw: Float[Tensor, "b s"], work: Work, how: Compositing) -> Float[T
     if how.clear_before > 0:
         following = torch.cat([work.z[..., 1:], work.z[..., -1:]], -1)
         density = density * (following > how.clear_before)
-    delta = composite.gaps(work.z, work.length)
-    return composite.weigh(density, delta, opaque_end=how.opaque_end)
+    delta = compositing.gaps(work.z, work.length)
+    return compositing.weigh(density, delta, opaque_end=how.opaque_end)
 
 
 def _as_they_come(weights: Float[Tensor, "b s"], work: Work) -> Float[Tensor, "b s"]:
@@ -213,7 +215,7 @@ def _mixed(
     """Light of each ray from the points that are kept; `feature` is theirs."""
     direction = work.direction[kept // work.z.shape[1]]
     colour = head.colour(feature[:, None], direction)[:, 0]
-    return composite.gather_kept(share, kept, colour)
+    return compositing.gather_kept(share, kept, colour)
 
 
 def _found(rgb: Tensor, weights: Tensor, work: Work, how: Compositing) -> Found:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sharpfield.core.camera import Camera
 from sharpfield.ops._dispatch import using
-from sharpfield.ops.rasterize import FAINTEST, MOST, Canvas, Drawn, rasterize
+from sharpfield.ops.rasterizer import FAINTEST, MOST, Canvas, Drawn, rasterize
 
 WIDTH, HEIGHT = 37, 21
 """Neither a multiple of a tile, so that borders are tested too."""

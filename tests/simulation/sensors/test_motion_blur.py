@@ -3,7 +3,7 @@ import pytest
 from scipy.ndimage import convolve
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.sensors.motion_kernel import (
+from sharpfield.simulation.sensors.motion_blur import (
     DrawnBlur,
     KernelRange,
     blurred,

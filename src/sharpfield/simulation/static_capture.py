@@ -23,7 +23,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.seed import numpy_generator
-from sharpfield.simulation.cameras.motion import CameraPath, motion, stamped
+from sharpfield.simulation.cameras.motions import CameraPath, motion, stamped
 from sharpfield.simulation.scenes.static import Scene, scene
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.events import EventPixels, Gap, joined, watch

@@ -8,7 +8,7 @@ import torch
 
 from sharpfield.core.seed import generator
 from sharpfield.ops import _dispatch
-from sharpfield.ops import composite as ops
+from sharpfield.ops import compositing as ops
 
 
 def rays(*shape: int, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor]:
