@@ -36,7 +36,7 @@ def test_plain_readers_agree_with_ours(kind: str, tmp_path: Path) -> None:
     recording = (open_dat if kind == "DAT" else open_evt)(path)
     found = recording.load()
     x, y, t_us, bright = PLAIN[kind](path.read_bytes()[read_header(path).length :])
-    assert len(found) == COPIES * len(events) and not str(recording.trouble)
+    assert len(found) == COPIES * len(events) and not str(recording.log)
     np.testing.assert_array_equal(found.t_us, t_us)
     np.testing.assert_array_equal(found.x[: len(events)], events.x)
     for ours, theirs in ((found.x, x), (found.y, y), (found.p > 0, bright)):
@@ -52,7 +52,7 @@ def test_bags_hold_the_same_events(tmp_path: Path) -> None:
     for name in ("ROS1.bag", "ROS2.mcap", "ROS2.db3"):
         recording = open_recording(tmp_path / name)
         found = recording.load()
-        assert recording.size == (events.width, events.height) and not str(recording.trouble)
+        assert recording.size == (events.width, events.height) and not str(recording.log)
         expected = (x, y, t_us, bright)
         for ours, theirs in zip((found.x, found.y, found.t_us, found.p > 0), expected, strict=True):
             np.testing.assert_array_equal(ours, theirs)

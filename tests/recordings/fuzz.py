@@ -126,7 +126,7 @@ def _read(open_function: Open, path: Path, *, most: int) -> str:
     except CaptureError as error:
         assert error.what and str(path) in str(error), f"no clear message: {error}"
         return "refused"
-    return "partial" if str(recording.trouble) else "whole"
+    return "partial" if str(recording.log) else "whole"
 
 
 def _expect_sound(recording: Recording, *, most: int) -> None:
@@ -203,9 +203,11 @@ WOUNDS = (_cut, _flip_bits, _drop, _splice, _overwrite, _repeat, _fill, _scrambl
 
 def main() -> None:
     """Read many damaged files of one kind, or of all."""
-    for path in sorted(Path(__file__).parent.glob("test_*.py")):
+    folder = Path(__file__).parent
+    for path in sorted(folder.rglob("test_*.py")):
         if "fuzz.register" in path.read_text():
-            importlib.import_module(f"tests.recordings.{path.stem}")
+            name = ".".join(path.relative_to(folder).with_suffix("").parts)
+            importlib.import_module(f"tests.recordings.{name}")
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--format", choices=sorted(CASES), help="one kind only")
     parser.add_argument("--files", type=int, default=20_000)

@@ -1,7 +1,4 @@
-"""Files read block by block, with a clear message when that fails.
-
-Compressed blocks of a file, unpacked without trusting what they say of themselves.
-"""
+"""Reading files block by block, and decompressing blocks with a limit on the output size."""
 
 import bz2
 import zipfile
@@ -12,31 +9,31 @@ from typing import Any
 from sharpfield.core.errors import CaptureError, need
 
 BLOCK = 2**21
-"""Bytes read at once; small enough to stay in the CPU's cache until they are decoded."""
+"""Bytes read at a time; small enough to stay in the CPU cache until they are decoded."""
 
 
 ZIP = b"PK\x03\x04"
-"""What zip archives begin with."""
+"""Signature of zip archives."""
 
 
-def head(path: Path, count: int) -> bytes:
-    """The first bytes of a file, `count` at most.
+def read_head(path: Path, count: int) -> bytes:
+    """Read the first bytes of a file, `count` at most.
 
     Raises:
         CaptureError: There is no such file, or it cannot be read.
     """
     if not path.is_file():
         raise CaptureError("recording not found", where=path)
-    for block in blocks(path, 0, count):
+    for block in read_blocks(path, 0, count):
         return block
     return b""
 
 
-def blocks(path: Path, start: int = 0, count: int = BLOCK) -> Iterator[bytes]:
-    """A file from the byte `start` to its end, `count` bytes at a time.
+def read_blocks(path: Path, start: int = 0, count: int = BLOCK) -> Iterator[bytes]:
+    """Read a file from the byte `start` to its end, `count` bytes at a time.
 
     Raises:
-        CaptureError: It cannot be read.
+        CaptureError: The file cannot be read.
     """
     try:
         with path.open("rb", buffering=0) as file:
@@ -48,7 +45,7 @@ def blocks(path: Path, start: int = 0, count: int = BLOCK) -> Iterator[bytes]:
 
 
 def zip_holds(path: Path, head: bytes, suffix: str) -> bool:
-    """Whether a file is a zip archive with a member whose name ends so."""
+    """Whether a file is a zip archive with a member whose name ends in `suffix`."""
     if not head.startswith(ZIP):
         return False
     try:
@@ -60,31 +57,32 @@ def zip_holds(path: Path, head: bytes, suffix: str) -> bool:
 
 Bytes = bytes | memoryview
 
-LIMIT = 2**28
-"""No sound block is larger once unpacked (16 million events)."""
+MAX_BLOCK = 2**28
+"""Most bytes of a decompressed block (16 million events); no valid one is larger."""
 
-PORTION = 2**22
-"""Bytes unpacked at once: asking for more makes room for more."""
-
-
-class Damaged(ValueError):
-    """A part of a file is not what it should be; whoever reads the file skips it and counts."""
+OUTPUT_STEP = 2**22
+"""Bytes decompressed at a time: decompressors allocate as much as is asked for."""
 
 
-def unpacked(data: Bytes, packing: str) -> Bytes:
-    """The block itself.
+class DamagedData(ValueError):
+    """A part of a file is invalid. Readers skip it and count it in their log."""
+
+
+def decompress(data: Bytes, compression: str) -> Bytes:
+    """Decompress a block.
 
     Args:
-        data: One whole frame.
-        packing: "none", "bz2", "lz4" (frames, not bare blocks) or "zstd".
+        data: One complete frame.
+        compression: "none", "bz2", "lz4" (frames, not bare blocks) or "zstd".
 
     Raises:
-        Damaged: It is torn, wrong, or larger than `LIMIT`; or no such packing is known.
-        MissingExtra: The package that unpacks it is not installed.
+        DamagedData: The block is truncated, invalid or larger than `MAX_BLOCK`, or the compression
+            is unknown.
+        MissingExtra: The package for this compression is not installed.
     """
-    if packing not in _UNPACK:
-        raise Damaged(f"packing {packing!r}")
-    return _UNPACK[packing](data)
+    if compression not in _DECOMPRESSORS:
+        raise DamagedData(f"compression {compression!r}")
+    return _DECOMPRESSORS[compression](data)
 
 
 def _none(data: Bytes) -> Bytes:
@@ -92,52 +90,54 @@ def _none(data: Bytes) -> Bytes:
 
 
 def _bz2(data: Bytes) -> bytes:
-    return _limited(bz2.BZ2Decompressor(), data, OSError)
+    return _decompressed(bz2.BZ2Decompressor(), data, OSError)
 
 
 def _lz4(data: Bytes) -> bytes:
-    frame: Any = need("lz4.frame", extra="io", purpose="reading a recording packed with LZ4")
-    return _limited(frame.LZ4FrameDecompressor(), data, RuntimeError)
+    frame: Any = need("lz4.frame", extra="io", purpose="reading a recording compressed with LZ4")
+    return _decompressed(frame.LZ4FrameDecompressor(), data, RuntimeError)
 
 
 def _zstd(data: Bytes) -> bytes:
-    zstd: Any = need("zstandard", extra="io", purpose="reading a recording packed with Zstandard")
+    zstd: Any = need(
+        "zstandard", extra="io", purpose="reading a recording compressed with Zstandard"
+    )
     try:
         with zstd.ZstdDecompressor(max_window_size=2**27).stream_reader(data) as reader:
-            found = _collected(iter(lambda: reader.read(PORTION), b""))
+            found = _joined(iter(lambda: reader.read(OUTPUT_STEP), b""))
     except zstd.ZstdError as error:
-        raise Damaged(str(error)) from None
+        raise DamagedData(str(error)) from None
     if not found:
-        raise Damaged("a torn block")
+        raise DamagedData("a truncated block")
     return found
 
 
-def _limited(decompressor: Any, data: Bytes, failure: type[Exception]) -> bytes:
-    def portions() -> Iterator[bytes]:
-        yield decompressor.decompress(data, max_length=PORTION)
+def _decompressed(decompressor: Any, data: Bytes, failure: type[Exception]) -> bytes:
+    def parts() -> Iterator[bytes]:
+        yield decompressor.decompress(data, max_length=OUTPUT_STEP)
         while not decompressor.eof:
             if decompressor.needs_input:
-                raise Damaged("a torn block")
-            yield decompressor.decompress(b"", max_length=PORTION)
+                raise DamagedData("a truncated block")
+            yield decompressor.decompress(b"", max_length=OUTPUT_STEP)
 
     try:
-        return _collected(portions())
+        return _joined(parts())
     except (failure, EOFError) as error:
-        raise Damaged(str(error)) from None
+        raise DamagedData(str(error)) from None
 
 
-def _collected(portions: Iterator[bytes]) -> bytes:
+def _joined(parts: Iterator[bytes]) -> bytes:
     found: list[bytes] = []
     size = 0
-    for portion in portions:
-        size += len(portion)
-        if size > LIMIT:
-            raise Damaged("a block that grows without end")
-        found.append(portion)
+    for part in parts:
+        size += len(part)
+        if size > MAX_BLOCK:
+            raise DamagedData("a block that grows without end")
+        found.append(part)
     return found[0] if len(found) == 1 else b"".join(found)
 
 
-_UNPACK: dict[str, Callable[[Bytes], Bytes]] = {
+_DECOMPRESSORS: dict[str, Callable[[Bytes], Bytes]] = {
     "none": _none,
     "bz2": _bz2,
     "lz4": _lz4,

@@ -1,15 +1,13 @@
-"""Pieces of events, as files happen to have them, joined to chunks that are sound.
+"""Events as files store them, checked, sorted and merged into chunks of bounded size.
 
-A file comes in packets, messages or blocks, of a few events or of millions. A reader turns each
-into a `RawChunk` and leaves the rest to `joined`, which drops and counts what cannot be (events
-outside the sensor, or earlier than those before them) and hands on large chunks.
+A file comes in packets, messages or blocks of a few events or of millions. A reader decodes each
+into a `RawChunk`; `merge_chunks` drops and counts invalid events (outside the sensor, or earlier
+than the events before them) and yields large chunks.
 
-Events that come a little late, put where they belong.
-
-Sensors read out row by row, and a clock that is sent in two parts is wrong between the two: events
-may come some microseconds after later ones. They are sorted as they are read, which needs the last
-few of every chunk to be held back. Whatever goes back further is no matter of readout: it is left
-where it is, for `pieces.joined` to judge.
+Events that arrive slightly late are sorted first, by a `ReorderBuffer`. Sensors are read out row
+by row, and a time sent in two words is wrong between the two: events may come some microseconds
+after later ones. Sorting needs the last events of each chunk to be held back. Events that are
+later than that are not a matter of readout; they stay in place for `merge_chunks` to judge.
 """
 
 from collections.abc import Iterator
@@ -25,20 +23,29 @@ from sharpfield.core.events import EventStream
 from sharpfield.recordings.recording import Chunks, ReadLog
 
 CHUNK = 2**20
-"""Most events in a chunk; all but the last one have at least half as many."""
+"""Most events in a chunk; all chunks but the last have at least half as many."""
 
-BACK_EVENTS, BACK_SHARE = 100, 0.01
+MAX_BACKWARD_EVENTS, MAX_BACKWARD_SHARE = 100, 0.01
 """Some cameras now and then deliver an event late. More than this many, and more than this share
-of all, mean that the file is not in the order of time at all."""
+of all events, mean that the file is not sorted by time at all."""
 
-OUTSIDE_EVENTS, OUTSIDE_SHARE = 100, 0.5
-"""Damage puts events outside the sensor. More than this many, and more than this share of all, mean
-that the size is that of another sensor, or that the columns are others."""
+MAX_OUTSIDE_EVENTS, MAX_OUTSIDE_SHARE = 100, 0.5
+"""Damage puts events outside the sensor. More than this many, and more than this share of all
+events, mean that the resolution is that of another sensor, or that columns are exchanged."""
+
+MAX_DELAY_US = 4096
+"""How late an event may come and still be sorted: one step of the high time word of EVT3."""
+
+MAX_HELD_BACK = CHUNK // 4
+"""Most events that are held back."""
+
+MAX_MEAN_MOVES = 64
+"""Most positions that an event is moved on average over a chunk; bounds the time of sorting."""
 
 
 @dataclass(frozen=True)
 class RawChunk:
-    """Consecutive events, not looked at yet."""
+    """Consecutive events, not validated yet."""
 
     x: UInt16[np.ndarray, "n"]
     y: UInt16[np.ndarray, "n"]
@@ -50,53 +57,52 @@ class RawChunk:
         """Number of events."""
         return len(self.t_us)
 
-    def __getitem__(self, part: slice | np.ndarray) -> "Piece":
-        """A slice as views, or a choice as copies."""
+    def __getitem__(self, part: slice | np.ndarray) -> "RawChunk":
+        """A slice as views, or selected events as copies."""
         return RawChunk(self.x[part], self.y[part], self.t_us[part], self.p[part])
 
 
-def joined(
-    pieces: Iterator[RawChunk], size: tuple[int, int], *, where: object, trouble: ReadLog
+def merge_chunks(
+    raw_chunks: Iterator[RawChunk], size: tuple[int, int], *, where: object, log: ReadLog
 ) -> Chunks:
-    """Sound chunks of half to a whole `CHUNK` of events, made of pieces of any size.
+    """Merge raw chunks of any size into valid chunks of `CHUNK` / 2 to `CHUNK` events.
 
     Args:
-        pieces: In the order of the file.
-        size: Width and height of the sensor.
+        raw_chunks: In the order of the file.
+        size: Sensor resolution, width and height.
         where: The file, for messages.
-        trouble: Is told what was dropped.
+        log: Counts what is dropped.
 
     Raises:
-        CaptureError: The events are not in the order of time, or most of them lie outside the
-            sensor.
+        CaptureError: Events are not sorted by time, or most of them lie outside the sensor.
     """
-    gate = _Gate(size, where, trouble)
+    validator = _Validator(size, where, log)
     waiting: list[RawChunk] = []
     count = 0
-    for piece in pieces:
-        sound = gate.passed(piece)
-        if not waiting and CHUNK // 2 <= len(sound) <= CHUNK:
-            yield _stream(sound, size)  # large enough as it is: not copied
+    for raw in raw_chunks:
+        valid = validator.validated(raw)
+        if not waiting and CHUNK // 2 <= len(valid) <= CHUNK:
+            yield _stream(valid, size)  # large enough as it is: not copied
             continue
-        waiting.append(sound)
-        count += len(sound)
+        waiting.append(valid)
+        count += len(valid)
         if count < CHUNK:
             continue
-        whole = _together(waiting)
+        whole = _concatenated(waiting)
         for first in range(0, count - CHUNK + 1, CHUNK):
             yield _stream(whole[first : first + CHUNK], size)
         waiting, count = [whole[count - count % CHUNK :]], count % CHUNK
     if count:
-        yield _stream(_together(waiting), size)
+        yield _stream(_concatenated(waiting), size)
 
 
-def known_size(
+def resolve_size(
     stated: tuple[int, int] | None, given: tuple[int, int] | None, where: object
 ) -> tuple[int, int]:
-    """Width and height of the sensor, from the file or from the caller.
+    """Sensor resolution, width and height, from the file or from the caller.
 
     Raises:
-        CaptureError: Neither says, or they contradict each other, or it is no size.
+        CaptureError: Neither gives it, they contradict each other, or it is out of range.
     """
     size = stated or given
     if size is None:
@@ -120,19 +126,19 @@ def known_size(
 def expect_inside(
     outside: int, count: int, furthest: tuple[float, float], size: tuple[int, int], where: object
 ) -> None:
-    """Make sure that the size is that of the sensor.
+    """Check that the resolution is that of the sensor.
 
     Args:
-        outside: How many events lie outside.
-        count: Of how many.
-        furthest: The largest column and row of these.
-        size: Width and height of the sensor.
+        outside: Number of events outside the sensor.
+        count: Number of all events.
+        furthest: Largest column and row among the events outside.
+        size: Sensor resolution, width and height.
         where: The file, for the message.
 
     Raises:
         CaptureError: Most events lie outside.
     """
-    if outside > max(OUTSIDE_EVENTS, OUTSIDE_SHARE * count):
+    if outside > max(MAX_OUTSIDE_EVENTS, MAX_OUTSIDE_SHARE * count):
         raise CaptureError(
             "most events lie outside the sensor",
             where=where,
@@ -142,140 +148,91 @@ def expect_inside(
         )
 
 
-class _Gate:
-    """Lets through what lies on the sensor and does not go back in time."""
-
-    def __init__(self, size: tuple[int, int], where: object, trouble: ReadLog) -> None:
-        self._size, self._where, self._trouble = size, where, trouble
-        self._last_us = np.iinfo(np.int64).min
-        self._seen = self._back = self._outside = 0
-
-    def passed(self, piece: RawChunk) -> RawChunk:
-        """The sound events of the next piece."""
-        if not _faultless(piece.x, piece.y, piece.t_us, *self._size, self._last_us):
-            outside, back = _faults(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
-            keep = _sound(piece.x, piece.y, piece.t_us, *self._size, self._last_us)
-            self._note(piece, outside, back, keep)
-            piece = piece[keep]
-        self._seen += len(piece)
-        if len(piece):
-            self._last_us = int(piece.t_us[-1])
-        return piece
-
-    def _note(self, piece: RawChunk, outside: int, back: int, keep: np.ndarray) -> None:
-        self._trouble.note("events outside the sensor", outside)
-        self._trouble.note("events earlier than those before them", back)
-        self._back += back
-        self._outside += outside
-        count = self._seen + self._outside + int(keep.sum())
-        furthest = float(piece.x.max()), float(piece.y.max())
-        expect_inside(self._outside, count, furthest, self._size, self._where)
-        if self._back > max(BACK_EVENTS, BACK_SHARE * (self._seen + len(piece))):
-            width, height = self._size
-            inside = (piece.x < width) & (piece.y < height)
-            late = int(np.flatnonzero(inside & ~keep)[0])
-            latest = max([self._last_us, *piece.t_us[:late][keep[:late]][-1:].tolist()])
-            raise CaptureError(
-                "event times are not ascending",
-                where=self._where,
-                got=f"event {self._seen + late} at {piece.t_us[late]} us after {latest} us,"
-                f" {self._back:,} such events so far",
-                do="sort the events by time (stable), and check that clock wraps were undone",
-            )
-
-
-def _together(pieces: list[RawChunk]) -> RawChunk:
-    if len(pieces) == 1:
-        return pieces[0]
-    return RawChunk(
-        x=np.concatenate([piece.x for piece in pieces]),
-        y=np.concatenate([piece.y for piece in pieces]),
-        t_us=np.concatenate([piece.t_us for piece in pieces]),
-        p=np.concatenate([piece.p for piece in pieces]),
-    )
-
-
-def _stream(piece: RawChunk, size: tuple[int, int]) -> EventStream:
-    return EventStream(piece.x, piece.y, piece.t_us, piece.p, width=size[0], height=size[1])
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _faultless(x, y, t_us, width, height, last_us):
-    """Whether all lie on the sensor and none goes back: in loops that look at many at a time."""
-    right, below, back = np.uint16(0), np.uint16(0), np.int64(0)
-    for i in range(x.size):
-        right, below = max(right, x[i]), max(below, y[i])
-    for i in range(1, t_us.size):
-        back += np.int64(t_us[i] < t_us[i - 1])
-    late = t_us.size > 0 and t_us[0] < last_us
-    return right < width and below < height and back == 0 and not late
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _faults(x, y, t_us, width, height, last_us):
-    """How many events lie outside, and how many inside are earlier than one before."""
-    outside = back = 0
-    for i in range(t_us.size):
-        if x[i] >= width or y[i] >= height:
-            outside += 1
-        elif t_us[i] < last_us:
-            back += 1
-        else:
-            last_us = t_us[i]
-    return outside, back
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _sound(x, y, t_us, width, height, last_us):
-    """Which events are neither."""
-    keep = np.zeros(t_us.size, np.bool_)
-    for i in range(t_us.size):
-        if x[i] < width and y[i] < height and t_us[i] >= last_us:
-            keep[i] = True
-            last_us = t_us[i]
-    return keep
-
-
-REACH_US = 4096
-"""How late an event may come: one step of the slower part of an EVT3 clock."""
-
-HELD = CHUNK // 4
-"""Most events that are held back."""
-
-MOVES = 64
-"""Most events that one is moved past, on average over a chunk; more is no matter of readout."""
-
-
-class Reorder:
-    """Room for a chunk of events, filled from the front and emptied in the order of time."""
+class ReorderBuffer:
+    """Buffer for one chunk of decoded events, flushed in the order of time."""
 
     def __init__(self) -> None:
         self.columns = _columns()
-        """x, y, t and p, to write to from `end` on."""
+        """x, y, t and p; decoders write from index `end` on."""
         self.end = 0
-        """How many events are there."""
+        """Number of events in the buffer."""
 
-    def taken(self, *, last: bool) -> RawChunk:
-        """The events so far, but for those that may have to wait for late ones.
+    def flush(self, *, last: bool) -> RawChunk:
+        """Take the events out, except those that late events may still have to precede.
 
         Args:
-            last: Whether no more will come, so that none has to wait.
+            last: Whether no more events will come, so that none is held back.
         """
         x, y, t, p = (column[: self.end] for column in self.columns)
         if not _ascending(t):
             _sort(x, y, t, p)
         cut = len(t)
         if not last and cut:
-            first = int(np.searchsorted(t, t[-1] - REACH_US))
-            cut = max(first, len(t) - HELD)
-        held = [column[cut:] for column in (x, y, t, p)]
+            first = int(np.searchsorted(t, t[-1] - MAX_DELAY_US))
+            cut = max(first, len(t) - MAX_HELD_BACK)
+        held_back = [column[cut:] for column in (x, y, t, p)]
         self.columns, self.end = _columns(), len(t) - cut
-        for column, rest in zip(self.columns, held, strict=True):
+        for column, rest in zip(self.columns, held_back, strict=True):
             column[: self.end] = rest
         return RawChunk(x[:cut], y[:cut], t[:cut], p[:cut])
+
+
+class _Validator:
+    """Drops events that lie outside the sensor or go back in time, over consecutive chunks."""
+
+    def __init__(self, size: tuple[int, int], where: object, log: ReadLog) -> None:
+        self._size, self._where, self._log = size, where, log
+        self._last_us = np.iinfo(np.int64).min
+        self._valid = self._backward = self._outside = 0
+
+    def validated(self, raw: RawChunk) -> RawChunk:
+        """The valid events of the next chunk."""
+        if not _all_valid(raw.x, raw.y, raw.t_us, *self._size, self._last_us):
+            outside, backward = _count_invalid(raw.x, raw.y, raw.t_us, *self._size, self._last_us)
+            keep = _valid(raw.x, raw.y, raw.t_us, *self._size, self._last_us)
+            self._count(raw, outside, backward, keep)
+            raw = raw[keep]
+        self._valid += len(raw)
+        if len(raw):
+            self._last_us = int(raw.t_us[-1])
+        return raw
+
+    def _count(self, raw: RawChunk, outside: int, backward: int, keep: np.ndarray) -> None:
+        self._log.note("events outside the sensor", outside)
+        self._log.note("events earlier than those before them", backward)
+        self._backward += backward
+        self._outside += outside
+        count = self._valid + self._outside + int(keep.sum())
+        furthest = float(raw.x.max()), float(raw.y.max())
+        expect_inside(self._outside, count, furthest, self._size, self._where)
+        limit = max(MAX_BACKWARD_EVENTS, MAX_BACKWARD_SHARE * (self._valid + len(raw)))
+        if self._backward > limit:
+            width, height = self._size
+            inside = (raw.x < width) & (raw.y < height)
+            late = int(np.flatnonzero(inside & ~keep)[0])
+            latest = max([self._last_us, *raw.t_us[:late][keep[:late]][-1:].tolist()])
+            raise CaptureError(
+                "event times are not ascending",
+                where=self._where,
+                got=f"event {self._valid + late} at {raw.t_us[late]} us after {latest} us,"
+                f" {self._backward:,} such events so far",
+                do="sort the events by time (stable), and check that clock wraps were undone",
+            )
+
+
+def _concatenated(chunks: list[RawChunk]) -> RawChunk:
+    if len(chunks) == 1:
+        return chunks[0]
+    return RawChunk(
+        x=np.concatenate([chunk.x for chunk in chunks]),
+        y=np.concatenate([chunk.y for chunk in chunks]),
+        t_us=np.concatenate([chunk.t_us for chunk in chunks]),
+        p=np.concatenate([chunk.p for chunk in chunks]),
+    )
+
+
+def _stream(chunk: RawChunk, size: tuple[int, int]) -> EventStream:
+    return EventStream(chunk.x, chunk.y, chunk.t_us, chunk.p, width=size[0], height=size[1])
 
 
 def _columns() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -286,22 +243,62 @@ def _columns() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _all_valid(x, y, t_us, width, height, last_us):
+    """Whether all events are valid; branch-free loops, which the compiler vectorises."""
+    right, below, backward = np.uint16(0), np.uint16(0), np.int64(0)
+    for i in range(x.size):
+        right, below = max(right, x[i]), max(below, y[i])
+    for i in range(1, t_us.size):
+        backward += np.int64(t_us[i] < t_us[i - 1])
+    late = t_us.size > 0 and t_us[0] < last_us
+    return right < width and below < height and backward == 0 and not late
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _count_invalid(x, y, t_us, width, height, last_us):
+    """Number of events outside the sensor, and of those inside that go back in time."""
+    outside = backward = 0
+    for i in range(t_us.size):
+        if x[i] >= width or y[i] >= height:
+            outside += 1
+        elif t_us[i] < last_us:
+            backward += 1
+        else:
+            last_us = t_us[i]
+    return outside, backward
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _valid(x, y, t_us, width, height, last_us):
+    """Mask of the valid events."""
+    keep = np.zeros(t_us.size, np.bool_)
+    for i in range(t_us.size):
+        if x[i] < width and y[i] < height and t_us[i] >= last_us:
+            keep[i] = True
+            last_us = t_us[i]
+    return keep
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def _ascending(t):
-    back = 0
+    backward = 0
     for i in range(1, t.size):
-        back += t[i] < t[i - 1]
-    return back == 0
+        backward += t[i] < t[i - 1]
+    return backward == 0
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _sort(x, y, t, p):
-    """Move each event before those that are later by at most `REACH_US`; ties keep their order."""
-    moves = MOVES * t.size
+    """Insertion sort that moves an event by at most `MAX_DELAY_US`; stable."""
+    moves = MAX_MEAN_MOVES * t.size
     for i in range(1, t.size):
         time, column, row, sign = t[i], x[i], y[i], p[i]
         j = i
-        while j > 0 and t[j - 1] > time and t[j - 1] - time <= REACH_US and moves > 0:
+        while j > 0 and t[j - 1] > time and t[j - 1] - time <= MAX_DELAY_US and moves > 0:
             t[j], x[j], y[j], p[j] = t[j - 1], x[j - 1], y[j - 1], p[j - 1]
             j -= 1
             moves -= 1

@@ -1,12 +1,12 @@
-"""What a camera's file holds, opened but not loaded.
+"""A camera recording: opened, but not loaded.
 
-A *recording* is what came out of one camera: events of one sensor, frames with their exposures,
-trigger edges, motion readings, each where the format has them. Nothing is read until asked for,
-and everything is read in pieces, so a recording may be larger than memory. Times are whole
-microseconds of the camera's own clock, as an int64; whatever wraps in the file is unwrapped.
+A *recording* is the output of one camera: events of one sensor, frames with their exposures, and
+trigger edges, each where the format has them. Nothing is read before it is asked for, and
+everything is read in chunks, so a recording may be larger than memory. Times are int64
+microseconds of the camera's own clock; counters that wrap in the file are unwrapped.
 
-Reading goes on as far as the data are sound. What had to be left out (a torn end, events outside
-the sensor) is said once, as a `ReadLog`; a file that is no recording at all is a `CaptureError`.
+Readers go as far as the data are valid. What they leave out (a truncated end, events outside the
+sensor) is counted in a `ReadLog`; a file that is no recording at all raises a `CaptureError`.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,21 +21,22 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 
 Chunks = Iterator[EventStream]
-"""Consecutive events of one sensor, in the order of time, a bounded number at a time."""
+"""Consecutive events of one sensor, sorted by time, a bounded number at a time."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a camera, as its file has it."""
+    """One image of a camera, as stored in the file."""
 
     image: Shaped[np.ndarray, "h w *c"]
-    """uint8 or uint16; grey [h w] (of a colour sensor: raw, see `Recording.bayer`) or RGB."""
+    """uint8 or uint16: [h w] grey, or raw behind a colour filter, see `Recording.bayer`; or [h w 3]
+    RGB."""
     open_us: int
-    """When its exposure began."""
+    """Start of the exposure."""
     close_us: int
-    """When its exposure ended; equal to `open_us` where the file gives only one time."""
+    """End of the exposure; equal to `open_us` where the file gives only one time."""
     name: str = ""
-    """Of the file it came from, where frames are files."""
+    """Name of the image file, where each frame is a file."""
 
 
 @dataclass(frozen=True)
@@ -50,73 +51,73 @@ class Triggers:
 
 @dataclass
 class ReadLog:
-    """What was left out while reading, counted by kind.
+    """Counts of what was left out while reading, by kind.
 
-    Events, frames and triggers are read each by itself, and as often as one likes. A reading begins
-    with `anew`, and what it notes takes the place of what the reading before it had noted: however
-    often a recording is read, the same is told once. So is what several readings meet, a torn end.
+    Events, frames and triggers are read in separate passes, each any number of times. A pass begins
+    with `start`, and its counts replace those of the previous pass of the same name, so reading
+    twice does not count twice. What several passes meet, such as a truncated end, counts once.
     """
 
-    noted: dict[str, int] = field(default_factory=dict)
-    """What was noted here, apart from readings."""
-    readings: dict[str, "Trouble"] = field(default_factory=dict)
-    """The latest of each kind, by name."""
+    own: dict[str, int] = field(default_factory=dict)
+    """Counts that belong to no pass."""
+    passes: dict[str, "ReadLog"] = field(default_factory=dict)
+    """Log of the latest pass, by name."""
 
-    def anew(self, reading: str) -> "Trouble":
-        """What takes the notes of a reading that begins: "events", "frames", "triggers"."""
-        self.readings[reading] = ReadLog()
-        return self.readings[reading]
+    def start(self, name: str) -> "ReadLog":
+        """The log of a new pass: "events", "frames" or "triggers"."""
+        self.passes[name] = ReadLog()
+        return self.passes[name]
 
     def note(self, kind: str, count: int = 1) -> None:
-        """Say that something was left out, in the plural: "events outside the sensor"."""
+        """Count something left out; `kind` is a plural, "events outside the sensor"."""
         if count:
-            self.noted[kind] = self.noted.get(kind, 0) + count
+            self.own[kind] = self.own.get(kind, 0) + count
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many of each kind were left out; where readings differ, the most."""
-        found = dict(self.noted)
-        for reading in self.readings.values():
-            for kind, count in reading.counts.items():
-                found[kind] = max(found.get(kind, 0), count)
-        return found
+        """How many of each kind were left out; the largest count where passes differ."""
+        total = dict(self.own)
+        for one in self.passes.values():
+            for kind, count in one.counts.items():
+                total[kind] = max(total.get(kind, 0), count)
+        return total
 
     def __str__(self) -> str:
-        """One line, "3 events outside the sensor, 1 torn packets"; empty if all was sound."""
+        """One line, "3 events outside the sensor, 1 truncated packets"; empty without any."""
         return ", ".join(f"{count:,} {kind}" for kind, count in self.counts.items())
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A camera's file, opened."""
+    """An opened recording."""
 
     path: Path
     layout: str
-    """The format by its usual name: "EVT3", "AEDAT4", "ROS1 bag" ..."""
+    """Usual name of the format: "EVT3", "AEDAT4", "ROS1 bag" ..."""
     size: tuple[int, int] | None = None
-    """Width and height of the event sensor in pixels; None where neither file nor caller says."""
+    """Resolution of the event sensor, width and height; None if it is unknown."""
     events: Callable[[], Chunks] | None = None
-    """Starts reading the events; None if the format has none. Each call starts anew."""
+    """Reads the events from the beginning at each call; None if there are none."""
     frames: Callable[[], Iterator[Frame]] | None = None
-    """Starts reading the frames; None if there are none."""
+    """Reads the frames from the beginning at each call; None if there are none."""
     triggers: Callable[[], Triggers] | None = None
-    """Reads the trigger edges; None if the format has none."""
+    """Reads the trigger edges; None if there are none."""
     bayer: str = ""
-    """Colour filter tile of the raw sensor, e.g. "RGGB"; "" if mono or not known."""
+    """Colour filter array of the raw sensor, e.g. "RGGB"; "" if monochrome or unknown."""
     thresholds: Thresholds | None = None
-    """Contrast thresholds, where the file states them."""
+    """Contrast thresholds, where the file gives them."""
     frame_encoding: str = ""
-    """How values of frames relate to light (see `core.frames.ENCODINGS`); "" if not known."""
-    trouble: ReadLog = field(default_factory=ReadLog)
-    """What reading has left out so far; reading again tells the same, and not twice as much."""
+    """How pixel values relate to light (see `core.frames.ENCODINGS`); "" if unknown."""
+    log: ReadLog = field(default_factory=ReadLog)
+    """What reading has left out so far."""
     notes: dict[str, str] = field(default_factory=dict)
-    """What the header says besides: camera, serial number, date, as the file spells it."""
+    """Other header entries as the file spells them: camera, serial number, date."""
 
     def chunks(self) -> Chunks:
         """Consecutive events, in bounded memory.
 
         Raises:
-            CaptureError: There are none in this kind of file, or they are unsound from the start.
+            CaptureError: The recording holds no events, or they are invalid from the start.
         """
         if self.events is None:
             raise CaptureError("the recording holds no events", where=self.path, got=self.layout)

@@ -1,18 +1,18 @@
-"""Frames alone: a video file, or a folder of images with a text that says when they were taken.
+"""Recordings of frames only: a video file, or a folder of images with a file of their times.
 
-A video tells when each frame is to be shown, which is when it was taken unless it is slow motion:
-then the caller says how many were taken per second. For a folder, times come from one of
+A video stores the time at which each frame is shown, which is the time of recording except in slow
+motion; then the caller gives the frame rate. For a folder, times come from one of
 
-    images.txt                       RPG: a line `t path` for each, t in s
+    images.txt                       RPG: a line `t path` for each image, t in s
     *exposure*.txt                   DSEC: `start, end`; or a file of starts and one of ends (EVDI)
-    *timestamp*.txt, *times*.txt     a time a line
+    *timestamp*.txt, *times*.txt     one time per line
     timestamps.npz                   Ev-DeblurNeRF: `timestamps_start`, `timestamps_end`
 
-beside the images or in the folder above. Only RPG's text implies a unit; the caller names that
-of the others, unless their header does.
+beside the images or in the folder above. Only RPG's text implies a unit; for the others the caller
+gives it, unless the header line names it.
 
 Source: Mueggler et al., *The Event-Camera Dataset and Simulator* (IJRR 2017), for `images.txt`;
-the others from data sets as published.
+the others from published data sets.
 """
 
 import re
@@ -34,33 +34,33 @@ from sharpfield.storage.images import list_images, read_image
 MAX_FPS = 1e6
 """Times are whole us."""
 
-TOLD = re.compile(r"\b(ns|us|ms|s)\b|_(ns|us|ms|s)\b|\[(ns|us|ms|s)\]")
-"""How a header names a unit."""
+HEADER_UNIT = re.compile(r"\b(ns|us|ms|s)\b|_(ns|us|ms|s)\b|\[(ns|us|ms|s)\]")
+"""A unit in a header line."""
 
 Times = tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]
-"""When each exposure begins and ends, in us; the same where only one time is known."""
+"""Start and end of each exposure in us; equal where only one time is known."""
 
 
 def open_video(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a video.
 
     Args:
-        path: Anything that FFmpeg decodes.
+        path: A file that FFmpeg decodes.
         options: `fps`, the rate of recording, where it differs from the rate of playback.
 
     Raises:
-        CaptureError: It cannot be decoded, or holds no video.
+        CaptureError: The file cannot be decoded, or holds no video.
     """
     interval_us = None if options.fps is None else 1e6 / _checked_fps(options.fps)
-    trouble = ReadLog()
+    log = ReadLog()
     first = next(_decoded(path, interval_us, ReadLog()), None)
     if first is None:
         raise CaptureError("the video holds no frames", where=path, do="copy or convert it again")
     return Recording(
         path,
         "video",
-        frames=lambda: _decoded(path, interval_us, trouble.anew("frames")),
-        trouble=trouble,
+        frames=lambda: _decoded(path, interval_us, log.start("frames")),
+        log=log,
         frame_encoding="srgb",
         notes={"frame_size": f"{first.image.shape[1]}x{first.image.shape[0]}"},
     )
@@ -75,7 +75,7 @@ def open_images(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
             no file of times; `times`, that file, where there are several candidates.
 
     Raises:
-        CaptureError: There are no images, or nothing says when they were taken.
+        CaptureError: There are no images, or their times are unknown.
     """
     listed = path / "images.txt"
     if options.times is None and options.fps is None and listed.is_file():
@@ -101,8 +101,8 @@ def open_images(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     return Recording(path, "images", frames=frames, frame_encoding="srgb")
 
 
-def _decoded(path: Path, interval_us: float | None, trouble: ReadLog) -> Iterator[Frame]:
-    """Frames of a video, as far as it can be decoded."""
+def _decoded(path: Path, interval_us: float | None, log: ReadLog) -> Iterator[Frame]:
+    """Frames of a video, up to the first that cannot be decoded."""
     count = 0
     try:
         with av.open(str(path), metadata_errors="replace") as container:
@@ -128,11 +128,11 @@ def _decoded(path: Path, interval_us: float | None, trouble: ReadLog) -> Iterato
             raise CaptureError(
                 "not a video that can be decoded", where=path, got=error, do="convert it again"
             ) from None
-        trouble.note("torn ends of videos")
+        log.note("truncated ends of videos")
 
 
 def _pixels(frame: av.VideoFrame) -> Shaped[np.ndarray, "h w *c"]:
-    """Grey as it is, all else as RGB; more than 8 bits stay 16."""
+    """Pixels as grey or RGB; uint16 for more than 8 bits."""
     deep = any(component.bits > 8 for component in frame.format.components)
     if len(frame.format.components) == 1 and not frame.format.is_bayer:
         return frame.to_ndarray(format="gray16le" if deep else "gray")
@@ -161,16 +161,16 @@ def _times(files: list[Path], options: ReaderOptions) -> Times:
 
 
 def _candidates(folder: Path) -> list[tuple[Path, ...]]:
-    """Files that may say when the images of a folder were taken; starts and ends are two."""
-    for place in (folder, folder.parent):
-        texts = [path for path in sorted(place.glob("*.txt")) if path.name != "images.txt"]
+    """Files that may hold the times of the images in a folder; a pair for starts and ends."""
+    for parent in (folder, folder.parent):
+        texts = [path for path in sorted(parent.glob("*.txt")) if path.name != "images.txt"]
         named = [path for path in texts if re.search("exposure|timestamp|times", path.name, re.I)]
         starts = [path for path in named if re.search("start", path.name, re.I)]
         ends = [path for path in named if re.search("end", path.name, re.I)]
         if len(starts) == len(ends) == 1 and starts != ends:
             return [(starts[0], ends[0])]
         exposures = [path for path in named if re.search("exposure", path.name, re.I)]
-        arrays = [path for path in (place / "timestamps.npz",) if path.is_file()]
+        arrays = [path for path in (parent / "timestamps.npz",) if path.is_file()]
         if exposures or named or arrays:
             return [(path,) for path in [*(exposures or named), *arrays]]
     return []
@@ -186,12 +186,12 @@ def _read_times(source: tuple[Path, ...], unit: str | None) -> Times:
             raise CaptureError(
                 "no times of images found", where=source[0], got=", ".join(arrays) or "no arrays"
             )
-        columns, told = [arrays[name].reshape(-1) for name in names], None
+        columns, header_unit = [arrays[name].reshape(-1) for name in names], None
     elif len(source) == 2:
-        (starts, told), (ends, _) = (_table(path) for path in source)
+        (starts, header_unit), (ends, _) = (_table(path) for path in source)
         columns = [starts[:, 0], ends[:, 0]]
     else:
-        table, told = _table(source[0])
+        table, header_unit = _table(source[0])
         columns = [table[:, 0], table[:, min(1, table.shape[1] - 1)]]
     if len(columns[0]) != len(columns[1]):
         raise CaptureError(
@@ -199,7 +199,7 @@ def _read_times(source: tuple[Path, ...], unit: str | None) -> Times:
             where=" and ".join(map(str, source)),
             got=f"{len(columns[0])} and {len(columns[1])}",
         )
-    unit = unit or told
+    unit = unit or header_unit
     if unit is None:
         raise _no_unit(source[0], columns[0])
     opens, closes = (whole_us(column, known_unit(unit), source[0]) for column in columns)
@@ -207,8 +207,8 @@ def _read_times(source: tuple[Path, ...], unit: str | None) -> Times:
 
 
 def _table(path: Path) -> tuple[Shaped[np.ndarray, "n k"], str | None]:
-    """Numbers of a text, and the unit that its header names."""
-    rows, told = [], None
+    """Numbers of a text file, and the unit that its header line names."""
+    rows, header_unit = [], None
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines()):
         words = line.replace(",", " ").split()
         if not words:
@@ -220,19 +220,19 @@ def _table(path: Path) -> tuple[Shaped[np.ndarray, "n k"], str | None]:
                 raise CaptureError(
                     "cannot read a time", where=f"{path}, line {number + 1}", got=line[:60]
                 ) from None
-            units = {unit for match in TOLD.findall(line) for unit in match if unit}
-            told = units.pop() if len(units) == 1 else told
+            units = {unit for match in HEADER_UNIT.findall(line) for unit in match if unit}
+            header_unit = units.pop() if len(units) == 1 else header_unit
     if not rows or len({len(row) for row in rows}) != 1:
         raise CaptureError(
             "a file of times needs the same number of columns in each line",
             where=path,
             got=f"{len(rows)} lines of {sorted({len(row) for row in rows})} columns",
         )
-    return np.array(rows), told
+    return np.array(rows), header_unit
 
 
 def _rpg(listed: Path) -> tuple[list[Path], Times]:
-    """Images and times of `images.txt`."""
+    """Images and times listed in `images.txt`."""
     files, seconds = [], []
     for number, line in enumerate(listed.read_text(encoding="utf-8").splitlines()):
         words = line.split(maxsplit=1)

@@ -7,7 +7,7 @@ from sharpfield.core.frames import Exposure
 from sharpfield.preparation.ingest.clock import find_offset, shifted, triggered, with_length
 from sharpfield.recordings.recording import Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.sensors.events import EventPixels, joined
+from sharpfield.simulation.sensors.events import EventPixels, merge_chunks
 
 SECONDS, FRAMES, INTERVAL_US = 6, 150, 33_333
 
@@ -62,7 +62,7 @@ def shaken(seed: int, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     change = np.abs(np.diff(np.log(np.maximum(light, 1 / 255)), axis=0)).mean(
         (1, 2), dtype=np.float64
     )
-    return change, opens_us + 5000, np.bincount(joined(gaps, (48, 32)).t_us // 1000)
+    return change, opens_us + 5000, np.bincount(merge_chunks(gaps, (48, 32)).t_us // 1000)
 
 
 def test_the_search_itself_is_not_late_but_events_of_high_thresholds_are():
@@ -183,8 +183,8 @@ def test_pulses_are_exposures():
 
 def test_an_edge_before_the_first_pulse_is_no_exposure():
     late = pulses(3)
-    torn = Triggers(late.t_us[1:], late.edge[1:], late.channel[1:])
-    assert triggered(torn, 2, channel=None, where="cam.raw").window(0) == (10_500, 14_500)
+    truncated = Triggers(late.t_us[1:], late.edge[1:], late.channel[1:])
+    assert triggered(truncated, 2, channel=None, where="cam.raw").window(0) == (10_500, 14_500)
 
 
 def test_one_of_several_channels_has_to_be_named():

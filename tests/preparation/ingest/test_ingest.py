@@ -252,12 +252,12 @@ def test_parts_that_are_written_are_not_written_again(truth, tmp_path):
     )
     stage = Stage(tmp_path / "capture", {"plan": 1}, part=65_536)
 
-    def torn():
+    def truncated():
         yield many[:100_000]
         raise Unplugged
 
     with pytest.raises(Unplugged):
-        stage.write(torn(), many[:0], span)
+        stage.write(truncated(), many[:0], span)
     written = {path.name: path.stat().st_mtime_ns for path in stage.folder.glob("part-*")}
     assert list(written) == ["part-000.h5"]
     stage = Stage(tmp_path / "capture", {"plan": 1}, part=65_536)

@@ -81,7 +81,7 @@ def test_events_of_a_davis(tmp_path: Path) -> None:
     records = [(davis_event(x, y, p), t) for x, y, t, p in rows(events)]
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records))
     expect_equal_events(read.load(), events)
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 def test_events_of_a_dvs128(tmp_path: Path) -> None:
@@ -102,7 +102,7 @@ def test_blocks_may_be_cut_anywhere(tmp_path: Path, monkeypatch, block: int) -> 
         return (data[i : i + block] for i in range(start, len(data), block))
 
     whole = open_aedat2(path).load()
-    monkeypatch.setattr("sharpfield.recordings.aedat.aedat2.blocks", cut)
+    monkeypatch.setattr("sharpfield.recordings.aedat.aedat2.read_blocks", cut)
     expect_equal_events(open_aedat2(path).load(), whole)
 
 
@@ -124,12 +124,12 @@ def test_what_is_no_event_is_told_apart(tmp_path: Path) -> None:
     ]
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records))
     np.testing.assert_array_equal(read.load().t_us, [10, 14])
-    assert read.trouble.counts == {"words of motion readings": 1, "events outside the sensor": 1}
+    assert read.log.counts == {"words of IMU samples": 1, "events outside the sensor": 1}
     triggers = read.triggers()
     assert (triggers.t_us.tolist(), triggers.edge.tolist()) == ([11], [1])
     records = [(dvs128_event(4, 5, 1), 10), (1 << 15, 11), (1 << 20, 12)]
     read = open_aedat2(recorded(tmp_path / "b.aedat", DVS128, records))
-    assert len(read.load()) == 1 and read.trouble.counts == {"records of no known kind": 1}
+    assert len(read.load()) == 1 and read.log.counts == {"records of no known kind": 1}
     assert read.triggers().t_us.tolist() == [11]
 
 
@@ -156,7 +156,7 @@ def test_frames_and_their_exposures(tmp_path: Path, rolling, opened, closed) -> 
     records += frame_records(30_000, images[1], rolling=rolling)
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records))
     frames = list(read.frames())
-    assert len(frames) == 2 and not str(read.trouble)
+    assert len(frames) == 2 and not str(read.log)
     for frame, image, start_us in zip(frames, images, (1000, 30_000), strict=True):
         np.testing.assert_array_equal(frame.image, image << 6)
         assert (frame.open_us, frame.close_us) == (start_us + opened, start_us + closed)
@@ -167,7 +167,7 @@ def test_a_torn_frame_is_counted(tmp_path: Path) -> None:
     records = frame_records(0, image, rolling=False)
     read = open_aedat2(recorded(tmp_path / "a.aedat", DAVIS, records[:-1]))
     assert not list(read.frames())
-    assert read.trouble.counts == {"torn frames": 1}
+    assert read.log.counts == {"truncated frames": 1}
 
 
 def test_a_torn_record_is_counted(tmp_path: Path) -> None:
@@ -175,7 +175,7 @@ def test_a_torn_record_is_counted(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-3])
     read = open_aedat2(path)
     assert len(read.load()) == 2
-    assert str(read.trouble) == "1 torn records"
+    assert str(read.log) == "1 truncated records"
 
 
 def test_the_camera_is_asked_for(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_the_real_recording(samples: Path) -> None:
     assert len(events) == 15_744
     assert (events.t_us[0], events.t_us[-1]) == (0, 2_210_588)
     assert (events.p > 0).sum() == 7870
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 def test_polarity_of_the_real_recording_fits_its_motion(samples: Path) -> None:

@@ -59,7 +59,7 @@ def test_events_and_other_packets(tmp_path: Path) -> None:
     read = open_aedat3(path)
     assert (read.layout, read.size) == ("AEDAT3.1", (240, 180))
     expect_equal_events(read.load(), events)
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 def test_bits_as_published(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_frames_and_their_exposures(tmp_path: Path, colours: tuple[int, ...]) ->
         recorded(tmp_path / "a.aedat", packet(2, len(stored), [stored, stored], overflow=1))
     )
     frames = list(read.frames())
-    assert len(frames) == 2 and not str(read.trouble)
+    assert len(frames) == 2 and not str(read.log)
     np.testing.assert_array_equal(frames[1].image, image)
     assert (frames[1].open_us, frames[1].close_us) == (2**31 + 100, 2**31 + 7100)
 
@@ -109,15 +109,15 @@ def test_what_cannot_be_read_is_counted(tmp_path: Path) -> None:
     )
     read = open_aedat3(path)
     assert read.load().t_us.tolist() == [3]
-    assert read.trouble.counts == {
+    assert read.log.counts == {
         "events marked invalid": 1,
         "events outside the sensor": 1,
         "damaged packets": 1,
-        "torn ends of the file": 1,
+        "truncated ends of the file": 1,
     }
     read = open_aedat3(path)
     assert not list(read.frames())
-    assert read.trouble.counts["damaged or partial frames"] == 1
+    assert read.log.counts["damaged or partial frames"] == 1
 
 
 def test_one_of_several_sources_is_chosen(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_what_is_written_is_read(tmp_path: Path, packing) -> None:
         np.testing.assert_array_equal(
             getattr(read.triggers(), name), getattr(recording.triggers(), name)
         )
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -157,7 +157,7 @@ def test_the_real_recording(samples: Path) -> None:
     assert [frame.image.shape for frame in frames] == [(260, 346)] * 4
     assert [frame.close_us - frame.open_us for frame in frames] == [500] * 4
     assert frames[0].open_us == 1589163147364965 and frames[0].image[0, 0] == 78
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 def test_another_library_reads_the_same_from_the_real_recording(samples: Path) -> None:
@@ -202,7 +202,7 @@ def test_frames_that_are_no_photographs_are_left_out_and_counted(tmp_path: Path)
     ]
     read = open_aedat4(container(tmp_path / "a.aedat4", stream(0, "FRME"), packets))
     assert len(list(read.frames())) == 1
-    assert read.trouble.counts == {
+    assert read.log.counts == {
         "frames made from events": 1,
         "frames of a part of the sensor": 1,
         "damaged frames": 2,
@@ -216,7 +216,7 @@ def test_events_that_cannot_be_are_left_out_and_counted(tmp_path: Path) -> None:
     packets = [(0, event_packet(events)), (0, b"no buffer at all"), (0, event_packet(events[4:]))]
     read = open_aedat4(container(tmp_path / "a.aedat4", stream(0, "EVTS"), packets))
     np.testing.assert_array_equal(read.load().t_us, [10, 20, 30, 30])
-    assert read.trouble.counts == {
+    assert read.log.counts == {
         "events outside the sensor": 1,
         "events earlier than those before them": 1,
         "damaged packets": 1,
@@ -231,7 +231,7 @@ def test_a_torn_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
     events = read.load()
     assert 10_000 < len(events) < 40_000
     expect_equal_events(events, recording.load()[: len(events)])
-    assert read.trouble.counts == {"torn ends of the file": 1}
+    assert read.log.counts == {"truncated ends of the file": 1}
 
 
 def test_several_cameras_must_be_chosen_from(tmp_path: Path) -> None:
@@ -299,10 +299,10 @@ def test_other_files_are_refused(tmp_path: Path, data: bytes) -> None:
 
 def test_a_block_that_grows_without_end_is_left_out(tmp_path: Path, monkeypatch) -> None:
     write_aedat4(tmp_path / "a.aedat4", some_recording(), packing="zstd")
-    monkeypatch.setattr("sharpfield.recordings.bytes.LIMIT", 10_000)
+    monkeypatch.setattr("sharpfield.recordings.bytes.MAX_BLOCK", 10_000)
     read = open_aedat4(tmp_path / "a.aedat4")
     assert len(read.load()) == 0
-    assert read.trouble.counts == {"damaged packets": 2}
+    assert read.log.counts == {"damaged packets": 2}
 
 
 @pytest.mark.parametrize("image", [np.zeros((4, 5), np.float32), np.zeros((4, 5, 2), np.uint8)])

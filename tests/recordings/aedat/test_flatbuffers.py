@@ -3,7 +3,7 @@ import struct
 import pytest
 
 from sharpfield.recordings.aedat.flatbuffers import root
-from sharpfield.recordings.bytes import Damaged
+from sharpfield.recordings.bytes import DamagedData
 from tests.recordings.aedat.flatbuffer_writer import Scalar, Tables, Vector, packed
 
 # By hand: size, root at 20, name; index of 8 bytes (two fields, at 4 and 8 of a table of 12 bytes);
@@ -61,13 +61,13 @@ def test_offsets_are_not_trusted(place: int) -> None:
             table.number(0, "I")
             table.vector(1, 2)
             table.tables(1)
-        except Damaged:
+        except DamagedData:
             continue
 
 
 def test_torn_buffers_are_refused() -> None:
     for length in range(len(BY_HAND)):
-        with pytest.raises(Damaged):
+        with pytest.raises(DamagedData):
             root(BY_HAND[:length], "NAME")
-    with pytest.raises(Damaged, match="no FRME buffer"):
+    with pytest.raises(DamagedData, match="no FRME buffer"):
         root(BY_HAND, "FRME")

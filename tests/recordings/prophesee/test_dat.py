@@ -50,7 +50,7 @@ def test_real_cars(samples: Path) -> None:
     assert len(events) == 2_009
     assert (events.t_us[-1], (events.p == 1).sum()) == (99_952, 1_350)
     assert listed(events)[:3] == [(25, 8, 0, -1), (67, 35, 35, -1), (56, 27, 152, 1)]
-    assert recording.layout == "DAT" and not str(recording.trouble)
+    assert recording.layout == "DAT" and not str(recording.log)
 
 
 def test_records(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_a_lone_time_is_no_wrap(tmp_path: Path) -> None:
     times = [100, 101, 101 + 2**31, 102, 103]
     recording = open_dat(write(tmp_path, b"".join(record(1, 1, t, 1) for t in times)))
     assert recording.load().t_us.tolist() == [100, 101, 102, 103]
-    assert str(recording.trouble) == "1 times out of line with those before and after"
+    assert str(recording.log) == "1 times out of line with those before and after"
 
 
 def test_events_that_come_a_little_late_are_put_in_order(tmp_path: Path) -> None:
@@ -92,8 +92,8 @@ def test_blocks_may_be_cut_anywhere(
 ) -> None:
     path = write(tmp_path, random_records(300))
     whole = listed(open_dat(path).load())
-    cut = dat.blocks
-    monkeypatch.setattr(dat, "blocks", lambda path, start: cut(path, start, block))
+    cut = dat.read_blocks
+    monkeypatch.setattr(dat, "read_blocks", lambda path, start: cut(path, start, block))
     assert len(whole) == 300 and listed(open_dat(path).load()) == whole
 
 
@@ -108,7 +108,7 @@ def test_trigger_edges(tmp_path: Path) -> None:
 
 def test_a_torn_end_is_told(tmp_path: Path) -> None:
     recording = open_dat(write(tmp_path, record(1, 2, 3, 1) + b"\x01\x02"))
-    assert len(recording.load()) == 1 and str(recording.trouble) == "1 torn records"
+    assert len(recording.load()) == 1 and str(recording.log) == "1 truncated records"
 
 
 def test_damaged_files_end_cleanly(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import format_of
-from sharpfield.recordings.prophesee.evt import decoded, open_evt, trigger_edges
+from sharpfield.recordings.prophesee.evt import decode_chunks, decode_triggers, open_evt
 from sharpfield.recordings.recording import ReadLog
 from sharpfield.storage.evt_writer import writing_evt
 from tests.recordings import fuzz
@@ -85,10 +85,10 @@ def listed(events: EventStream) -> list[Event]:
 def decode(
     encoding: str, data: bytes, *, block: int = 2**20, size: tuple[int, int] = HD
 ) -> tuple[list[Event], str]:
-    trouble = ReadLog()
+    log = ReadLog()
     cut = [data[i : i + block] for i in range(0, len(data), block)]
-    found = decoded(encoding, cut, size, where="test", trouble=trouble)
-    return [event for part in found for event in listed(part)], str(trouble)
+    found = decode_chunks(encoding, cut, size, where="test", log=log)
+    return [event for part in found for event in listed(part)], str(log)
 
 
 def write(folder: Path, header: str | bytes, data: bytes = b"") -> Path:
@@ -201,7 +201,7 @@ def test_evt2_words() -> None:
         [(639, 479, t, 1), (0, 0, t, -1), (5, 6, t + 1, 1)],
         "",
     )
-    found = trigger_edges("evt2", [data], where="test")
+    found = decode_triggers("evt2", [data], where="test")
     assert (found.t_us.tolist(), found.edge.tolist(), found.channel.tolist()) == ([327], [1], [3])
 
 
@@ -216,7 +216,7 @@ def test_evt21_words() -> None:
     )
     events = [(32, 7, t, 1), (45, 7, t, 1), (63, 7, t, 1), (94, 8, t, -1)]
     assert decode("evt2.1", data) == (events, "")
-    found = trigger_edges("evt2.1", [data], where="test")
+    found = decode_triggers("evt2.1", [data], where="test")
     assert (found.t_us.tolist(), found.edge.tolist(), found.channel.tolist()) == ([t], [-1], [1])
 
 
@@ -227,7 +227,7 @@ def test_evt3_words() -> None:
     events = [(9, 5, t, 1), (8, 5, t, -1), (100, 5, t, 1), (111, 5, t, 1), (112, 5, t, 1)]
     events += [(131, 5, t, 1), (1279, 6, t, 1)]
     assert decode("evt3", evt3(*words)) == (events, "")
-    found = trigger_edges("evt3", [evt3(*words)], where="test")
+    found = decode_triggers("evt3", [evt3(*words)], where="test")
     assert (found.t_us.tolist(), found.edge.tolist(), found.channel.tolist()) == ([t], [1], [2])
 
 
@@ -249,15 +249,15 @@ def test_rows_of_the_second_camera_count_and_those_of_exposure_do_not() -> None:
 def test_a_new_high_time_clears_the_low_one_and_a_repeated_one_does_not() -> None:
     words = [high3(4096), low3(4000), y3(0), x3(1, 1), high3(4096), x3(2, 1), high3(8192), x3(3, 1)]
     words += [low3(2), x3(4, 1)]
-    events, trouble = decode("evt3", evt3(*words))
-    assert [event[2] for event in events] == [8096, 8096, 8192, 8194] and not trouble
+    events, log = decode("evt3", evt3(*words))
+    assert [event[2] for event in events] == [8096, 8096, 8192, 8194] and not log
 
 
 def test_a_low_time_that_decreases_is_no_overflow() -> None:
     """Counting 4096 us for each makes 54 ms of the 9 ms of a real sample."""
     words = [high3(4096), low3(100), y3(0), x3(1, 1), low3(95), x3(2, 1), low3(103), x3(3, 1)]
-    events, trouble = decode("evt3", evt3(*words))
-    assert events == [(2, 0, 4191, 1), (1, 0, 4196, 1), (3, 0, 4199, 1)] and not trouble
+    events, log = decode("evt3", evt3(*words))
+    assert events == [(2, 0, 4191, 1), (1, 0, 4196, 1), (3, 0, 4199, 1)] and not log
 
 
 @pytest.mark.parametrize("step", [1, 2000])
@@ -267,8 +267,8 @@ def test_high_times_wrap(step: int) -> None:
         words += [0x8000 | high % 4096, low3(5), y3(0), x3(i % 1000, 1)]
         expected.append(high * 4096 + 5)
         high += step
-    events, trouble = decode("evt3", evt3(*words))
-    assert [event[2] for event in events] == expected and not trouble
+    events, log = decode("evt3", evt3(*words))
+    assert [event[2] for event in events] == expected and not log
 
 
 def test_a_wrap_that_hesitates_counts_once() -> None:
@@ -281,8 +281,8 @@ def test_a_wrap_that_hesitates_counts_once() -> None:
 def test_evt2_times_wrap_after_four_hours() -> None:
     t = (1 << 34) - 10
     data = evt2(*[w for k in range(0, 64, 8) for w in (high2(t + k), cd2(1, 1, t + k, 1))])
-    events, trouble = decode("evt2", data)
-    assert [event[2] for event in events] == [t + k for k in range(0, 64, 8)] and not trouble
+    events, log = decode("evt2", data)
+    assert [event[2] for event in events] == [t + k for k in range(0, 64, 8)] and not log
 
 
 @pytest.mark.parametrize("block", [3, 2**20])
@@ -292,10 +292,10 @@ def test_a_high_time_that_nothing_confirms_is_refused(block: int, wrong: int) ->
     words = []
     for high in (1000, 1001, wrong, 1002, 1003):
         words += [0x8000 | high, low3(7), y3(0), x3(1, 1)]
-    events, trouble = decode("evt3", evt3(*words), block=block)
+    events, log = decode("evt3", evt3(*words), block=block)
     highs = [event[2] // 4096 for event in events]
     assert highs == [1000, 1001, 1001, 1002, 1003]
-    assert trouble == "1 times out of line with those before and after"
+    assert log == "1 times out of line with those before and after"
 
 
 def test_events_before_any_time_are_left_out() -> None:
@@ -314,7 +314,7 @@ def test_real_evt2(samples: Path) -> None:
     assert (events.t_us[0], events.t_us[-1]) == (1_317_888, 1_367_888)
     assert (events.x.max(), events.y.max()) == (599, 475)
     assert (events.p == 1).sum() == 367_855
-    assert recording.notes["serial_number"] == "30384338" and not str(recording.trouble)
+    assert recording.notes["serial_number"] == "30384338" and not str(recording.log)
 
 
 def test_real_evt3(samples: Path) -> None:
@@ -330,7 +330,7 @@ def test_real_evt3(samples: Path) -> None:
         (events.p > 0, other["p"]),
     ):
         np.testing.assert_array_equal(ours, theirs)
-    assert not str(recording.trouble)
+    assert not str(recording.log)
 
 
 def test_a_file_is_read_as_often_as_one_likes(tmp_path: Path) -> None:
@@ -340,7 +340,7 @@ def test_a_file_is_read_as_often_as_one_likes(tmp_path: Path) -> None:
     assert recording.triggers is not None
     edges = recording.triggers()
     assert 0 < len(edges.t_us) < 10 and (np.diff(edges.t_us) >= 0).all()
-    assert str(recording.trouble) == "1 torn words"
+    assert str(recording.log) == "1 truncated words"
 
 
 def test_a_header_may_end_without_saying_so(tmp_path: Path) -> None:
@@ -385,7 +385,7 @@ def test_events_outside_the_sensor_are_dropped_and_counted(tmp_path: Path) -> No
     data = evt3(high3(0), low3(1), y3(1), *(x3(i, 1) for i in range(70)))
     recording = open_evt(write(tmp_path, evt3_header((64, 48)), data))
     assert len(recording.load()) == 64
-    assert str(recording.trouble) == "6 events outside the sensor"
+    assert str(recording.log) == "6 events outside the sensor"
 
 
 # Errors
@@ -456,7 +456,7 @@ def test_headers_of_many_hands(header: str, tmp_path: Path) -> None:
         # The vector crosses the right edge.
         found = [(x, p) for x, _, _, p in listed(recording.load())]
         assert found == [(56 + i, 1) for i in range(8)] + [(63, -1)]
-        assert str(recording.trouble) == "4 events outside the sensor"
+        assert str(recording.log) == "4 events outside the sensor"
 
 
 def test_a_header_alone_whose_last_line_does_not_end(tmp_path: Path) -> None:

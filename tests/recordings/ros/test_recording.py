@@ -56,7 +56,7 @@ def test_what_is_written_is_read(tmp_path: Path, colours, kind) -> None:
     expect_equal_events(read.load(), recording.load())
     if recording.frames:
         expect_equal_frames(list(read.frames()), list(recording.frames()))
-    assert not str(read.trouble)
+    assert not str(read.log)
 
 
 def test_raw_colour_keeps_its_tile(tmp_path: Path) -> None:
@@ -110,7 +110,7 @@ def test_events_of_dvs_msgs(tmp_path: Path, container: str) -> None:
         folder.mkdir()
         read = open_rosbag(ros.write(folder, sent))
         expect_equal_events(read.load(), events)
-        assert not str(read.trouble) and read.frames is None and read.triggers is None
+        assert not str(read.log) and read.frames is None and read.triggers is None
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_images(tmp_path: Path, container: str) -> None:
     for frame, expected in zip(frames, [grey, deep, colour, colour], strict=True):
         np.testing.assert_array_equal(frame.image, expected)
         assert (frame.open_us, frame.close_us) == (10**6, 10**6)
-    assert read.events is None and not str(read.trouble)
+    assert read.events is None and not str(read.log)
 
 
 def test_images_packed_as_png(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_images_packed_as_png(tmp_path: Path) -> None:
     frames = list(read.frames())
     assert len(frames) == 1 and (frames[0].open_us, frames[0].close_us) == (5, 5)
     np.testing.assert_array_equal(frames[0].image, colour)
-    assert read.trouble.counts == {"damaged frames": 1}
+    assert read.log.counts == {"damaged frames": 1}
 
 
 # --- packets of event_camera_msgs
@@ -286,7 +286,7 @@ def test_real_recordings_of_evt3(samples: Path, name: str) -> None:
     assert events.t_us[-1] - events.t_us[0] == 2_078_178
     assert events.t_us[0] == 1_675_956_550_318_679
     assert (events.p > 0).sum() == 125_183
-    assert not str(read.trouble)
+    assert not str(read.log)
     assert len(read.triggers().t_us) == 4157
 
 
@@ -327,7 +327,7 @@ def test_torn_bags_are_read_as_far_as_they_go(tmp_path: Path) -> None:
         path = ros.write(folder, arrays(ros, events, messages=40))
         file = path if path.is_file() else next(path.glob("*.mcap"))
         if container == "ros1":
-            # Its chunks are large: put the end of the only one into the torn part.
+            # Its chunks are large: put the end of the only one into the truncated part.
             file.write_bytes(file.read_bytes()[:-100])
         else:
             file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
@@ -335,7 +335,7 @@ def test_torn_bags_are_read_as_far_as_they_go(tmp_path: Path) -> None:
         found = read.load()
         assert 1000 < len(found) <= 2000
         expect_equal_events(found, events[: len(found)])
-        assert "torn ends of the file" in read.trouble.counts
+        assert "truncated ends of the file" in read.log.counts
 
 
 def test_a_bag_is_known_by_what_it_begins_with(tmp_path: Path) -> None:
@@ -361,14 +361,14 @@ def test_damaged_messages_are_left_out_and_counted(tmp_path: Path) -> None:
     sent = arrays(ros, events)
     store = ros.store.serialize_ros1
 
-    def torn(message: object, kind: str) -> bytes:
+    def truncated(message: object, kind: str) -> bytes:
         data = bytes(store(message, kind))
         return data[:-1] if message is sent[1][2] else data
 
-    ros.store.serialize_ros1 = torn
+    ros.store.serialize_ros1 = truncated
     read = open_rosbag(ros.write(tmp_path, sent))
     assert len(read.load()) == 300
-    assert read.trouble.counts == {"damaged messages": 1}
+    assert read.log.counts == {"damaged messages": 1}
 
 
 def test_one_of_several_topics_is_chosen(tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def test_a_part_that_cannot_be_unpacked_ends_the_events(tmp_path, monkeypatch):
     path.write_bytes(data)
     recording = open_hdf5(path, ReaderOptions(size=SIZE))
     assert len(recording.load()) == 200
-    assert str(recording.trouble) == "300 events from a damaged part onwards"
+    assert str(recording.log) == "300 events from a damaged part onwards"
 
 
 def test_the_packing_of_prophesee_needs_its_plugin(tmp_path):

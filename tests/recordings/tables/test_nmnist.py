@@ -40,7 +40,7 @@ def test_real_files(
     recording = open_nmnist(samples / "ncaltech_nmnist" / name, ReaderOptions(size=size))
     events = recording.load()
     assert (len(events), events.t_us[0], events.t_us[-1]) == (count, first_us, last_us)
-    assert not str(recording.trouble)
+    assert not str(recording.log)
 
 
 def test_records(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_records(tmp_path: Path) -> None:
     events = recording.load()
     assert (events.x.tolist(), events.y.tolist()) == ([33, 0], [1, 33])
     assert (events.t_us.tolist(), events.p.tolist()) == ([70_000, 2**23 - 1], [1, -1])
-    assert str(recording.trouble) == "1 torn records"
+    assert str(recording.log) == "1 truncated records"
 
 
 def test_pauses_are_no_events(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def expect_same(recording) -> None:
         np.testing.assert_array_equal(getattr(found, name), getattr(EVENTS, name), name)
     assert found.x.dtype == np.uint16
     assert (found.width, found.height) == SIZE
-    assert str(recording.trouble) == ""
+    assert str(recording.log) == ""
 
 
 def saved(path: Path, write: Callable, *args, **arrays) -> Path:
@@ -114,7 +114,7 @@ def test_events_beside_the_sensor_are_counted(tmp_path):
         saved(tmp_path / "e.npz", np.savez, **wide), ReaderOptions(unit="us", size=SIZE)
     )
     assert len(recording.load()) == 450
-    assert str(recording.trouble) == "50 events outside the sensor"
+    assert str(recording.log) == "50 events outside the sensor"
 
 
 def test_rectified_positions_stay_between_pixels(tmp_path):

@@ -63,7 +63,7 @@ def test_real_clips(clip: str, samples: Path) -> None:
     recording = open_davis(path)
     events = recording.load()
     other = np.loadtxt(path)
-    assert len(events) == 30_000 and not str(recording.trouble)
+    assert len(events) == 30_000 and not str(recording.log)
     np.testing.assert_array_equal(events.t_us, np.floor(other[:, 0] * 1e6 + 0.5))
     for ours, theirs in ((events.x, other[:, 1]), (events.y, other[:, 2])):
         np.testing.assert_array_equal(ours, theirs)
@@ -97,14 +97,14 @@ def test_numbers(line: str, expected: tuple[int, int, int, int], tmp_path: Path)
 def test_lines_that_are_no_events_are_counted(line: str, tmp_path: Path) -> None:
     recording = open_davis(write(tmp_path, f"0.1 2 3 1\n{line}\n0.2 3 4 0\n"))
     assert listed(recording.load()) == [(100_000, 2, 3, 1), (200_000, 3, 4, -1)]
-    assert str(recording.trouble) == "1 lines that could not be read"
+    assert str(recording.log) == "1 lines that could not be read"
 
 
 def test_remarks_of_v2e(tmp_path: Path) -> None:
     lines = "#!events.txt\n# created Thu Dec  3 2020\n# t x y p\n0.5 1 2 0\n\n% more\n0.6 3 4 1"
     recording = open_davis(write(tmp_path, lines))
     assert listed(recording.load()) == [(500_000, 1, 2, -1), (600_000, 3, 4, 1)]
-    assert not str(recording.trouble)
+    assert not str(recording.log)
 
 
 def test_the_first_line_may_be_the_size(tmp_path: Path) -> None:
@@ -156,9 +156,9 @@ def test_blocks_may_be_cut_anywhere(
 ) -> None:
     path = write(tmp_path, "240 180\n# a\n" + rpg_lines(200))
     whole = listed(open_text(path).load())
-    cut = text.blocks
+    cut = text.read_blocks
     recording = open_text(path)
-    monkeypatch.setattr(text, "blocks", lambda path: cut(path, 0, block))
+    monkeypatch.setattr(text, "read_blocks", lambda path: cut(path, 0, block))
     assert len(whole) == 200 and listed(recording.load()) == whole
 
 

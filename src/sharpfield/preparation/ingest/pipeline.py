@@ -283,7 +283,7 @@ class _Ingest:
 
     def _heed(self, recording: Recording) -> None:
         """Keep what a pass through a recording left out; each pass meets the same."""
-        for kind, count in recording.trouble.counts.items():
+        for kind, count in recording.log.counts.items():
             self._left[kind] = max(self._left.get(kind, 0), count)
 
     def _crop(

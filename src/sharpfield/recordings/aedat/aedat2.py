@@ -1,9 +1,9 @@
-"""AEDAT2, the files of jAER (and of v2e): events of DVS128 and DAVIS cameras, frames of the latter.
+"""AEDAT2, the files of jAER (and v2e): events of DVS128 and DAVIS cameras, frames of the latter.
 
-After `#` lines come records of eight bytes, big-endian: a 32-bit address and a 32-bit time in us,
-which wraps. What the bits of an address mean depends on the camera, which newer files name in
-their header (`# AEChip: ...`); of an older one the caller says the size. Addresses count from the
-lower corners of the image; here x and y are as everywhere, from the upper left.
+After header lines that begin with `#` come records of eight bytes, big-endian: a 32-bit address and
+a 32-bit time in us, which wraps. The bits of an address depend on the camera model, which newer
+files name in their header (`# AEChip: ...`); for older files the resolution identifies it.
+Addresses count from the lower corners of the image; x and y here count from the upper left.
 
     DVS128     0 polarity (0 brighter) · 1-7 x from the right · 8-14 y · 15 external input
     DAVIS      31 is 0: 10 external input · 11 polarity (1 brighter) · 12-21 x from the right
@@ -11,12 +11,12 @@ lower corners of the image; here x and y are as everywhere, from the upper left.
                31 is 1: 0-9 sample of a pixel · 10-11 what is read: 0 reset, 1 signal, 3 motion
                · 12-21 x from the left · 22-30 y
 
-A *frame* of a DAVIS is read twice: every pixel after its reset, and again after its exposure; the
-image is the difference. With a global shutter all pixels are reset before the first signal
-is read, and the exposure lies between these readings; with a rolling one it is that of the first
-column. Motion readings are passed over and counted.
+A *frame* of a DAVIS is read out twice: every pixel after its reset, and again after its exposure;
+the image is the difference. With a global shutter all pixels are reset before the first signal is
+read, and the exposure lies between the two readouts; with a rolling shutter the exposure of the
+first column is taken. IMU samples are skipped and counted.
 
-Source: https://docs.inivation.com, "AEDAT 2.0"; the cameras' classes in jAER for the directions.
+Source: https://docs.inivation.com, "AEDAT 2.0"; the camera classes of jAER for the axis directions.
 """
 
 from collections.abc import Iterator
@@ -30,14 +30,14 @@ from jaxtyping import Int64, UInt32
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import blocks, head
-from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.bytes import read_blocks, read_head
+from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT2.0"
-LONGEST_HEADER, LONGEST_LINE = 2**20, 2**14
-"""Preferences of jAER may be part of it."""
+MAX_HEADER, MAX_LINE = 2**20, 2**14
+"""Most bytes of a header, which may hold the preferences of jAER, and of a line."""
 
 CAMERAS = {
     "dvs128": (128, 128),
@@ -48,27 +48,27 @@ CAMERAS = {
     "davis346": (346, 260),
     "davis640": (640, 480),
 }
-"""Sizes, by a part of the name of the camera's class."""
+"""Resolution by a part of the camera's class name."""
 
 DVS128 = CAMERAS["dvs128"]
 
-RESET, SIGNAL, MOTION = 0, 1, 3
+RESET, SIGNAL, IMU = 0, 1, 3
 BITS = 10
-"""Of a sample."""
+"""Bits of a sample."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where records begin, and how to understand them."""
+    """Position and meaning of the records of a file."""
 
     path: Path
     begin: int
     size: tuple[int, int]
-    trouble: ReadLog
+    log: ReadLog
 
     @property
     def davis(self) -> bool:
-        """Whether addresses are those of a DAVIS."""
+        """Whether the addresses are those of a DAVIS."""
         return self.size != DVS128
 
 
@@ -76,13 +76,13 @@ def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of jAER.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`, which identifies the camera where the header does not.
 
     Raises:
-        CaptureError: It is no AEDAT2, or its camera is not known.
+        CaptureError: The file is no AEDAT2, or its camera model is unknown.
     """
-    start = head(path, LONGEST_HEADER)
+    start = read_head(path, MAX_HEADER)
     if not start.startswith(FIRST_LINE):
         raise CaptureError("the file is no AEDAT2", where=path, got=start[:16])
     lines, begin = _header(start)
@@ -90,7 +90,7 @@ def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         (line.partition(":")[2] for line in lines if line.startswith("AEChip:")), ""
     ).strip()
     stated = next((size for name, size in CAMERAS.items() if name in chip.lower()), None)
-    size = known_size(stated, options.size, path)
+    size = resolve_size(stated, options.size, path)
     if size not in CAMERAS.values():
         known = ", ".join(
             f"{width} x {height}" for width, height in dict.fromkeys(CAMERAS.values())
@@ -109,18 +109,18 @@ def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         events=partial(_events, layout),
         frames=partial(_frames, layout) if layout.davis else None,
         triggers=partial(_triggers, layout),
-        trouble=layout.trouble,
+        log=layout.log,
         notes={"camera": chip.rpartition(".")[2]} if chip else {},
     )
 
 
 def _header(start: bytes) -> tuple[list[str], int]:
-    """Its lines without their `#`, and where it ends."""
+    """Header lines without their `#`, and the offset of the data."""
     lines: list[str] = []
     at = 0
-    while start[at : at + 1] == b"#" and (end := start.find(b"\n", at, at + LONGEST_LINE)) >= 0:
+    while start[at : at + 1] == b"#" and (end := start.find(b"\n", at, at + MAX_LINE)) >= 0:
         text = start[at + 1 : end]
-        # A record may begin with the byte of "#", too; no text has a zero.
+        # A record may begin with the byte of "#", too; but no text has a zero byte.
         if b"\0" in text:
             break
         lines.append(text.decode("latin-1").strip())
@@ -131,7 +131,7 @@ def _header(start: bytes) -> tuple[list[str], int]:
 def _records(layout: Layout) -> Iterator[tuple[UInt32[np.ndarray, "n"], Int64[np.ndarray, "n"]]]:
     """Addresses and unwrapped times of consecutive records."""
     rest, before = b"", -1
-    for block in blocks(layout.path, layout.begin):
+    for block in read_blocks(layout.path, layout.begin):
         data = rest + block
         whole = len(data) // 8 * 8
         records = np.frombuffer(data[:whole], ">u4").reshape(-1, 2).astype(np.uint32)
@@ -140,29 +140,29 @@ def _records(layout: Layout) -> Iterator[tuple[UInt32[np.ndarray, "n"], Int64[np
             t_us = _unwrapped(records[:, 1], before)
             before = int(t_us[-1])
             yield records[:, 0], t_us
-    layout.trouble.note("torn records", int(len(rest) > 0))
+    layout.log.note("truncated records", int(len(rest) > 0))
 
 
 def _events(layout: Layout) -> Chunks:
-    layout = replace(layout, trouble=layout.trouble.anew("events"))
-    return joined(_pieces(layout), layout.size, where=layout.path, trouble=layout.trouble)
+    layout = replace(layout, log=layout.log.start("events"))
+    return merge_chunks(_raw_chunks(layout), layout.size, where=layout.path, log=layout.log)
 
 
-def _pieces(layout: Layout) -> Iterator[RawChunk]:
+def _raw_chunks(layout: Layout) -> Iterator[RawChunk]:
     width, height = layout.size
     for address, t_us in _records(layout):
         if layout.davis:
-            columns, count, motion = _davis(address, t_us, width, height)
-            layout.trouble.note("words of motion readings", motion)
+            columns, count, imu = _davis(address, t_us, width, height)
+            layout.log.note("words of IMU samples", imu)
         else:
             columns, count, unknown = _dvs128(address, t_us)
-            layout.trouble.note("records of no known kind", unknown)
+            layout.log.note("records of no known kind", unknown)
         yield RawChunk(*columns)[:count]
 
 
 def _triggers(layout: Layout) -> Triggers:
-    """The file tells when the input changed, and not which way: all edges are rising ones."""
-    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
+    """Trigger edges; the file does not give their direction, so all are taken as rising."""
+    layout = replace(layout, log=layout.log.start("triggers"))
     used, external = (0x8000_0400, 0x400) if layout.davis else (0xFFFF_8000, 0x8000)
     found = [t_us[address & np.uint32(used) == external] for address, t_us in _records(layout)]
     t_us = np.concatenate([np.empty(0, np.int64), *found])
@@ -170,75 +170,75 @@ def _triggers(layout: Layout) -> Triggers:
 
 
 def _frames(layout: Layout) -> Iterator[Frame]:
-    """Images of a DAVIS, scaled to 16 bits."""
-    layout = replace(layout, trouble=layout.trouble.anew("frames"))
-    reading = _Reading(layout)
+    """Frames of a DAVIS, scaled to 16 bits."""
+    layout = replace(layout, log=layout.log.start("frames"))
+    readout = _Readout(layout)
     for address, t_us in _records(layout):
-        samples = (address >> np.uint32(31) == 1) & (address >> np.uint32(10) & 3 != MOTION)
-        yield from reading.taken(address[samples], t_us[samples])
-    yield from reading.finished()
+        samples = (address >> np.uint32(31) == 1) & (address >> np.uint32(10) & 3 != IMU)
+        yield from readout.add(address[samples], t_us[samples])
+    yield from readout.finish()
 
 
-class _Reading:
-    """Samples, collected until a frame is whole."""
+class _Readout:
+    """Collects samples until a frame is complete."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         width, height = layout.size
         self._samples = np.full((2, height, width), -1, np.int16)
         self._spans: list[list[int] | None] = [None, None]
-        """First and last time of either reading."""
+        """First and last time of the reset and of the signal readout."""
 
-    def taken(
+    def add(
         self, address: UInt32[np.ndarray, "n"], t_us: Int64[np.ndarray, "n"]
     ) -> Iterator[Frame]:
-        """Sort in the next samples; a frame whenever a new one begins."""
+        """Add samples; yields the previous frame whenever a new one begins."""
         kind = (address >> np.uint32(10) & 3).astype(np.int8)
         # A frame begins where signals end and resets follow, unless both are interleaved.
         for first, last in _runs(kind):
-            reading = int(kind[first])
-            if reading not in (RESET, SIGNAL):
-                self._layout.trouble.note("samples of an unknown kind", last - first)
+            part = int(kind[first])
+            if part not in (RESET, SIGNAL):
+                self._layout.log.note("samples of an unknown kind", last - first)
                 continue
-            if reading == RESET and self._whole(SIGNAL):
-                yield from self.finished()
-            self._put(reading, address[first:last], t_us[first:last])
+            if part == RESET and self._complete(SIGNAL):
+                yield from self.finish()
+            self._put(part, address[first:last], t_us[first:last])
 
-    def finished(self) -> Iterator[Frame]:
-        """The frame collected, if it is whole; the next one may begin."""
+    def finish(self) -> Iterator[Frame]:
+        """Yield the collected frame if it is complete, and start the next one."""
         reset, signal = self._spans
         if reset is not None or signal is not None:
-            if self._whole(RESET) and self._whole(SIGNAL) and reset and signal:
+            if self._complete(RESET) and self._complete(SIGNAL) and reset and signal:
                 difference = self._samples[RESET] - self._samples[SIGNAL]
                 image = np.clip(difference, 0, 2**BITS - 1).astype(np.uint16) << (16 - BITS)
-                # Of a rolling shutter, signals begin before the last reset: the first column's.
+                # Rolling shutter: signals begin before the last reset; take the first column.
                 opened = reset[1] if reset[1] <= signal[0] else reset[0]
                 if opened <= signal[0]:
                     yield Frame(image, opened, signal[0])
             else:
-                self._layout.trouble.note("torn frames")
+                self._layout.log.note("truncated frames")
         self._samples[:] = -1
         self._spans = [None, None]
 
-    def _whole(self, reading: int) -> bool:
-        return bool((self._samples[reading] >= 0).all())
+    def _complete(self, part: int) -> bool:
+        return bool((self._samples[part] >= 0).all())
 
     def _put(
-        self, reading: int, address: UInt32[np.ndarray, "n"], t_us: Int64[np.ndarray, "n"]
+        self, part: int, address: UInt32[np.ndarray, "n"], t_us: Int64[np.ndarray, "n"]
     ) -> None:
         width, height = self._layout.size
         x = (address >> np.uint32(12) & 0x3FF).astype(np.int64)
         y = height - 1 - (address >> np.uint32(22) & 0x1FF).astype(np.int64)
         inside = (x < width) & (y >= 0)
-        self._layout.trouble.note("samples outside the sensor", int((~inside).sum()))
+        self._layout.log.note("samples outside the sensor", int((~inside).sum()))
         samples = (address & (2**BITS - 1)).astype(np.int16)
-        self._samples[reading, y[inside], x[inside]] = samples[inside]
-        span = self._spans[reading] or [int(t_us[0]), int(t_us[0])]
-        self._spans[reading] = [span[0], int(t_us[-1])]
+        self._samples[part, y[inside], x[inside]] = samples[inside]
+        span = self._spans[part] or [int(t_us[0]), int(t_us[0])]
+        self._spans[part] = [span[0], int(t_us[-1])]
 
 
 def _runs(kind: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Begin and end of each run of equal values."""
+    """Begin and end index of each run of equal values."""
     ends = [*(np.flatnonzero(np.diff(kind)) + 1).tolist(), len(kind)]
     begins = [0, *ends[:-1]]
     return ((first, last) for first, last in zip(begins, ends, strict=True) if last > first)
@@ -247,7 +247,7 @@ def _runs(kind: np.ndarray) -> Iterator[tuple[int, int]]:
 @njit(cache=True, nogil=True)
 @no_type_check
 def _unwrapped(t, before):
-    """Times that go on where 32 bits wrap: always by the shorter way, be it backwards."""
+    """Unwrapped 32-bit times: each step is the shorter one, forwards or backwards."""
     t_us = np.empty(t.size, np.int64)
     if before < 0 and t.size:
         before = np.int64(t[0])
@@ -261,27 +261,27 @@ def _unwrapped(t, before):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _davis(address, t, width, height):
-    """x, y, t and p of events, how many there are, and how many words of motion readings."""
+    """x, y, t and p of the events, their number, and the number of IMU words."""
     x, y = np.empty(t.size, np.uint16), np.empty(t.size, np.uint16)
     t_us, p = np.empty(t.size, np.int64), np.empty(t.size, np.int8)
-    count = motion = 0
+    count = imu = 0
     for i in range(t.size):
         word = np.int64(address[i])
         if word & 0x80000400 == 0:
-            # Beyond the border these become negative, which as unsigned is outside too.
+            # Beyond the border these are negative, which is outside the sensor as unsigned, too.
             x[count] = width - 1 - ((word >> 12) & 0x3FF)
             y[count] = height - 1 - ((word >> 22) & 0x1FF)
             t_us[count], p[count] = t[i], 1 if word & 0x800 else -1
             count += 1
         elif word & 0x80000C00 == 0x80000C00:
-            motion += 1
-    return (x, y, t_us, p), count, motion
+            imu += 1
+    return (x, y, t_us, p), count, imu
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _dvs128(address, t):
-    """x, y, t and p of events, how many there are, and how many records are of no known kind."""
+    """x, y, t and p of the events, their number, and the number of records of unknown kind."""
     x, y = np.empty(t.size, np.uint16), np.empty(t.size, np.uint16)
     t_us, p = np.empty(t.size, np.int64), np.empty(t.size, np.int8)
     count = unknown = 0

@@ -1,14 +1,15 @@
 """AEDAT3.1, the files of iniVation's cAER: events, frames with their exposures, triggers.
 
-A header of `#` lines up to `#!END-HEADER`, then packets of one kind of event each, little-endian:
-28 bytes of head, and events of equal size. Times of 31 bits are continued by a counter in the
-head. Every camera is a *source* with a number and a name, which tells the size of its sensor.
+Header lines that begin with `#`, up to `#!END-HEADER`, then packets of one event type each,
+little-endian: a packet header of 28 bytes, and events of equal size. Times have 31 bits; a counter
+in the packet header extends them. Every camera is a *source* with a number and a name, which
+determines the sensor resolution.
 
-    special     type 0, 8 bytes: valid · what, 7 bits · time         triggers are among them
+    special     type 0, 8 bytes: valid · kind, 7 bits · time         triggers are among them
     polarity    type 1, 8 bytes: valid · polarity · y, 15 bits · x, 15 bits · time
     frame       type 2: valid · channels, 3 bits · four times · size · position · 16-bit pixels
 
-Motion readings and what other modules of cAER add are passed over. (0, 0) is the upper left.
+IMU samples and packets of other modules of cAER are skipped. (0, 0) is the upper left.
 Source: https://docs.inivation.com, "AEDAT 3.1"; the event types of libcaer.
 """
 
@@ -24,13 +25,13 @@ import numpy as np
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import head
-from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.bytes import read_head
+from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE, LAST_LINE = b"#!AER-DAT3.1\r\n", b"#!END-HEADER\r\n"
-LONGEST_HEADER = 2**20
+MAX_HEADER = 2**20
 
 SIZES = {
     "DVS128": (128, 128),
@@ -43,15 +44,15 @@ SIZES = {
     "DAVISHET640": (640, 480),
     "DVXPLORER": (640, 480),
 }
-"""By what a source's name begins with."""
+"""Resolution by the beginning of the source's name."""
 
 SPECIAL, POLARITY, FRAME = 0, 1, 2
 
 HEAD = struct.Struct("<hhiiiiii")
 FRAME_HEAD = struct.Struct("<Iiiiiiiii")
 
-LARGEST = 2**28
-"""Bytes of a packet; no sound one has more."""
+MAX_PACKET = 2**28
+"""Most bytes of a valid packet."""
 
 EDGES = {
     2: (1, 0), 3: (-1, 0), 4: (1, 0),
@@ -59,58 +60,58 @@ EDGES = {
     9: (1, 2), 10: (-1, 2), 11: (1, 2),
     12: (1, 3), 13: (-1, 3),
 }  # fmt: skip
-"""Edge and channel by type of special event; 3 is the camera's generator."""
+"""Edge and channel by kind of special event; channel 3 is the camera's signal generator."""
 
 
-class Head(NamedTuple):
-    """What a packet says of itself."""
+class PacketHeader(NamedTuple):
+    """Header of a packet."""
 
     kind: int
     source: int
     size: int
     """Bytes of an event."""
     time_at: int
-    """Where in an event its time is."""
+    """Offset of the time in an event."""
     overflow: int
-    """How often times have wrapped."""
+    """How often the 31-bit time has wrapped."""
     capacity: int
     count: int
     valid: int
 
 
 class Packet(NamedTuple):
-    """Events of one kind."""
+    """Events of one type."""
 
     size: int
     """Bytes of an event."""
     since_us: int
-    """To be added to their times."""
+    """Offset to add to their times."""
     count: int
     data: bytes
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where packets begin, and whose are read."""
+    """Offset of the first packet, and the source to read."""
 
     path: Path
     begin: int
     source: int
-    trouble: ReadLog = field(default_factory=ReadLog)
+    log: ReadLog = field(default_factory=ReadLog)
 
 
 def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of cAER.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`, where the camera's name does not tell it; `topic`, the number of one of
             several sources.
 
     Raises:
-        CaptureError: It is no AEDAT3.1, or has several sources and none was chosen.
+        CaptureError: The file is no AEDAT3.1, or has several sources and none was chosen.
     """
-    start = head(path, LONGEST_HEADER)
+    start = read_head(path, MAX_HEADER)
     end = start.find(LAST_LINE)
     if not start.startswith(FIRST_LINE) or end < 0:
         raise CaptureError(
@@ -122,7 +123,7 @@ def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     named = re.findall(r"^#Source (\d{1,4}): *([^\r\n]*)", start[:end].decode("latin-1"), re.M)
     sources = {int(number): name.strip() for number, name in named}
     source = _chosen(sources, options.topic, path)
-    size = known_size(_size(sources[source]), options.size, path)
+    size = resolve_size(_size(sources[source]), options.size, path)
     layout = Layout(path, end + len(LAST_LINE), source)
     return Recording(
         path,
@@ -131,7 +132,7 @@ def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         events=partial(_events, layout, size),
         frames=partial(_frames, layout) if sources[source].upper().startswith("DAVIS") else None,
         triggers=partial(_triggers, layout),
-        trouble=layout.trouble,
+        log=layout.log,
         notes={"camera": sources[source]},
     )
 
@@ -155,20 +156,20 @@ def _size(name: str) -> tuple[int, int] | None:
 
 
 def _events(layout: Layout, size: tuple[int, int]) -> Chunks:
-    layout = replace(layout, trouble=layout.trouble.anew("events"))
-    return joined(_pieces(layout), size, where=layout.path, trouble=layout.trouble)
+    layout = replace(layout, log=layout.log.start("events"))
+    return merge_chunks(_raw_chunks(layout), size, where=layout.path, log=layout.log)
 
 
-def _pieces(layout: Layout) -> Iterator[RawChunk]:
+def _raw_chunks(layout: Layout) -> Iterator[RawChunk]:
     for packet in _packets(layout, POLARITY, 8):
         words = np.frombuffer(packet.data, "<u4").reshape(-1, 2)
         x, y, t_us, p, count = _columns(words, packet.since_us)
-        layout.trouble.note("events marked invalid", packet.count - count)
+        layout.log.note("events marked invalid", packet.count - count)
         yield RawChunk(x, y, t_us, p)[:count]
 
 
 def _triggers(layout: Layout) -> Triggers:
-    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
+    layout = replace(layout, log=layout.log.start("triggers"))
     found: list[tuple[int, int, int]] = []
     for packet in _packets(layout, SPECIAL, 8):
         for word, time in struct.iter_unpack("<Ii", packet.data):
@@ -180,17 +181,17 @@ def _triggers(layout: Layout) -> Triggers:
 
 
 def _frames(layout: Layout) -> Iterator[Frame]:
-    layout = replace(layout, trouble=layout.trouble.anew("frames"))
+    layout = replace(layout, log=layout.log.start("frames"))
     for packet in _packets(layout, FRAME, FRAME_HEAD.size):
         for first in range(0, len(packet.data), packet.size):
             frame = _frame(packet.data[first : first + packet.size], packet.since_us)
-            layout.trouble.note("damaged or partial frames", int(frame is None))
+            layout.log.note("damaged or partial frames", int(frame is None))
             if frame is not None:
                 yield frame
 
 
 def _frame(data: bytes, since_us: int) -> Frame | None:
-    """The image, or None if it is not one of the whole sensor."""
+    """Decode a frame; None if it is invalid or does not cover the whole sensor."""
     info, _, _, opened, closed, width, height, left, top = FRAME_HEAD.unpack_from(data)
     channels = info >> 1 & 7
     count = width * height * channels
@@ -205,53 +206,53 @@ def _frame(data: bytes, since_us: int) -> Frame | None:
 
 
 def _packets(layout: Layout, kind: int, least: int) -> Iterator[Packet]:
-    """The packets of one kind and of the source chosen; the others are passed over unread."""
+    """Packets of one type from the chosen source; others are skipped without reading them."""
     length = layout.path.stat().st_size
     with layout.path.open("rb") as file:
-        place = layout.begin
-        while place < length:
-            start = _head(file, place)
-            if start is None or (room := _room(file, place, start, length)) is None:
-                layout.trouble.note("torn ends of the file")
+        offset = layout.begin
+        while offset < length:
+            start = _packet_header(file, offset)
+            if start is None or (capacity := _capacity(file, offset, start, length)) is None:
+                layout.log.note("truncated ends of the file")
                 return
-            place += HEAD.size
+            offset += HEAD.size
             if (start.kind, start.source) == (kind, layout.source) and start.count:
-                file.seek(place)
+                file.seek(offset)
                 data = file.read(start.size * start.count)
                 # Only frames may be of any size.
                 if start.size == least or (kind == FRAME and start.size > least):
                     yield Packet(start.size, start.overflow << 31, start.count, data)
                 else:
-                    layout.trouble.note("damaged packets")
-            place += start.size * room
+                    layout.log.note("damaged packets")
+            offset += start.size * capacity
 
 
-def _head(file: BinaryIO, place: int) -> Head | None:
-    """What a packet says of itself, if that can be."""
-    file.seek(place)
+def _packet_header(file: BinaryIO, offset: int) -> PacketHeader | None:
+    """Header of the packet at an offset; None if it is invalid."""
+    file.seek(offset)
     data = file.read(HEAD.size)
     if len(data) < HEAD.size:
         return None
-    found = Head(*HEAD.unpack(data))
+    found = PacketHeader(*HEAD.unpack(data))
     sound = 0 < found.size and 0 <= found.time_at < found.size and found.overflow >= 0
     sound = sound and 0 <= found.valid <= found.count <= found.capacity
-    return found if sound and found.size * found.count <= LARGEST else None
+    return found if sound and found.size * found.count <= MAX_PACKET else None
 
 
-def _room(file: BinaryIO, place: int, start: Head, length: int) -> int | None:
-    """For how many events a packet has room: for all that it could hold, or that it does hold."""
-    for room in (start.capacity, start.count):
-        end = place + HEAD.size + start.size * room
-        if end == length or (end < length and _head(file, end) is not None):
-            return room
-    # The packet is whole, and damage follows.
-    return start.count if place + HEAD.size + start.size * start.count <= length else None
+def _capacity(file: BinaryIO, offset: int, start: PacketHeader, length: int) -> int | None:
+    """Number of event slots in a packet: its capacity, or only the events that it holds."""
+    for slots in (start.capacity, start.count):
+        end = offset + HEAD.size + start.size * slots
+        if end == length or (end < length and _packet_header(file, end) is not None):
+            return slots
+    # The packet is complete, and damage follows.
+    return start.count if offset + HEAD.size + start.size * start.count <= length else None
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _columns(words, since_us):
-    """x, y, t and p of the valid events, and how many there are."""
+    """x, y, t and p of the valid events, and their number."""
     x, y = np.empty(len(words), np.uint16), np.empty(len(words), np.uint16)
     t_us, p = np.empty(len(words), np.int64), np.empty(len(words), np.int8)
     count = 0

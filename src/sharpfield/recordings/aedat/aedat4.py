@@ -1,11 +1,11 @@
 """AEDAT4, the files of iniVation's DV software: events, frames with their exposures, triggers.
 
-A file is a line, a header, and *packets*: the number of a *stream*, a size, and a buffer, usually
-compressed. The header is XML and says what each stream holds: EVTS, FRME, TRIG or IMUS (skipped).
-Times are us since 1970. Packets may be followed by a table of them, which reading does not need.
+A file is a signature line, a header, and *packets*: the number of a *stream*, a size, and a
+FlatBuffer, usually compressed. The header holds XML that gives the type of each stream: EVTS, FRME,
+TRIG or IMUS (skipped). Times are us since 1970. A table of packets may follow, which is not needed.
 
-The exposure of a frame is stored as its two ends; where DV has left these out, as its length after
-the frame's own time. Frames that DV has made from events are no photographs and are left out.
+The exposure of a frame is stored as its start and end; where DV leaves these out, as a duration
+from the frame's own time. Frames that DV computed from events are left out.
 
 Source: https://docs.inivation.com, "AEDAT 4.0", and the flatbuffer schemas of dv-processing.
 """
@@ -23,13 +23,13 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.aedat.flatbuffers import Table, root
-from sharpfield.recordings.bytes import Damaged, head, unpacked
-from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.bytes import DamagedData, decompress, read_head
+from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 
 FIRST_LINE = b"#!AER-DAT4.0\r\n"
-PACKINGS = ("none", "lz4", "lz4", "zstd", "zstd")
+COMPRESSIONS = ("none", "lz4", "lz4", "zstd", "zstd")
 EVENT = np.dtype(
     {
         "names": ["t", "x", "y", "on"],
@@ -39,18 +39,18 @@ EVENT = np.dtype(
     }
 )
 PIXELS = {0: ("u1", 1), 2: ("<u2", 1), 16: ("u1", 3), 18: ("<u2", 3), 24: ("u1", 4), 26: ("<u2", 4)}
-"""Type and channels of a pixel, by the numbers of OpenCV; colours are stored as BGR."""
+"""Data type and channels of a pixel, by OpenCV's type number; colours are stored as BGR."""
 
 MADE_FROM_EVENTS = (2, 3, 5, 6)
-"""Sources of a frame: accumulation, motion compensation, reconstruction, visualisation."""
+"""Frame sources to skip: accumulation, motion compensation, reconstruction, visualisation."""
 
 EDGES = {1: (1, 0), 2: (-1, 0), 3: (1, 0), 4: (1, 1), 5: (-1, 1)}
-"""Edge and channel by type of trigger: 0 is the camera's input, 1 its generator."""
+"""Edge and channel by trigger type; channel 0 is the camera's input, 1 its signal generator."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What the header says of a stream."""
+    """A stream, as the header describes it."""
 
     number: int
     kind: str
@@ -60,33 +60,33 @@ class Stream:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where packets are, and what they hold."""
+    """Position of the packets, and the streams they belong to."""
 
     path: Path
     begin: int
     end: int
-    packing: str
+    compression: str
     streams: dict[int, Stream]
-    trouble: ReadLog = field(default_factory=ReadLog)
+    log: ReadLog = field(default_factory=ReadLog)
 
 
 def open_aedat4(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of DV.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`, where the file does not give it; `topic`, which of several cameras, by its
             name in the file or by the number of a stream.
 
     Raises:
-        CaptureError: It is no AEDAT4; it has streams of several cameras and none was chosen.
+        CaptureError: The file is no AEDAT4, or has streams of several cameras and none was chosen.
     """
     layout = _layout(path)
     events, frames = (_chosen(layout, kind, options.topic) for kind in ("EVTS", "FRME"))
     triggers = [stream.number for stream in layout.streams.values() if stream.kind == "TRIG"]
     size, read_events = options.size, None
     if events is not None:
-        size = known_size(layout.streams[events].size, size, path)
+        size = resolve_size(layout.streams[events].size, size, path)
         read_events = partial(_events, layout, events, size)
     return Recording(
         path,
@@ -95,7 +95,7 @@ def open_aedat4(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         events=read_events,
         frames=None if frames is None else partial(_frames, layout, frames),
         triggers=partial(_triggers, layout, triggers) if triggers else None,
-        trouble=layout.trouble,
+        log=layout.log,
         notes={
             f"stream {stream.number}": f"{stream.kind} of {stream.source or 'unknown source'}"
             for stream in layout.streams.values()
@@ -104,42 +104,42 @@ def open_aedat4(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
 
 
 def _layout(path: Path) -> Layout:
-    head(path, 1)  # says so if there is no such file
+    read_head(path, 1)  # raises if there is no such file
     length = path.stat().st_size
     try:
         with path.open("rb") as file:
             if file.read(len(FIRST_LINE)) != FIRST_LINE:
-                raise Damaged("another first line")
+                raise DamagedData("another first line")
             prefix = file.read(4)
             rest = int.from_bytes(prefix, "little")
             if len(prefix) < 4 or rest > length - file.tell():
-                raise Damaged("the header is torn")
+                raise DamagedData("the header is truncated")
             header = root(prefix + file.read(rest), "IOHE")
             begin = file.tell()
-        packing = header.number(0, "i")
+        compression = header.number(0, "i")
         table = header.number(1, "q", -1)
-        if not 0 <= packing < len(PACKINGS):
-            raise Damaged(f"compression {packing}")
+        if not 0 <= compression < len(COMPRESSIONS):
+            raise DamagedData(f"compression {compression}")
         streams = _streams(bytes(header.vector(2, 1)))
-    except Damaged as problem:
+    except DamagedData as problem:
         raise CaptureError(
             "the file is no AEDAT4", where=path, got=problem, do="copy it again from the camera"
         ) from None
-    layout = Layout(path, begin, length, PACKINGS[packing], streams)
+    layout = Layout(path, begin, length, COMPRESSIONS[compression], streams)
     if table > 0:
-        layout.trouble.note("tables of packets beyond the end of the file", table > length)
-        return Layout(path, begin, min(table, length), layout.packing, streams, layout.trouble)
+        layout.log.note("tables of packets beyond the end of the file", table > length)
+        return Layout(path, begin, min(table, length), layout.compression, streams, layout.log)
     return layout
 
 
 def _streams(xml: bytes) -> dict[int, Stream]:
-    """What each stream holds; the header is trusted to be XML without definitions."""
+    """Parse the stream descriptions; XML with entity definitions is refused."""
     if b"<!" in xml:
-        raise Damaged("definitions in the XML of the header")
+        raise DamagedData("definitions in the XML of the header")
     try:
         outputs = ET.fromstring(xml).find("./node[@name='outInfo']")
     except (ET.ParseError, UnicodeDecodeError, ValueError, LookupError) as error:
-        raise Damaged(f"the XML of the header: {error}") from None
+        raise DamagedData(f"the XML of the header: {error}") from None
     found: dict[int, Stream] = {}
     for node in () if outputs is None else outputs.findall("node"):
         number = _whole(node.get("name"))
@@ -155,7 +155,7 @@ def _streams(xml: bytes) -> dict[int, Stream]:
             source=node.findtext("node[@name='info']/attr[@key='source']") or "",
         )
     if not found:
-        raise Damaged("no streams in the header")
+        raise DamagedData("no streams in the header")
     return found
 
 
@@ -164,7 +164,7 @@ def _whole(text: str | None) -> int | None:
 
 
 def _chosen(layout: Layout, kind: str, topic: str | None) -> int | None:
-    """The stream of a kind that is meant, or None if there is none."""
+    """Number of the chosen stream of a type; None if there is no stream of this type."""
     found = [stream for stream in layout.streams.values() if stream.kind == kind]
     if topic is not None:
         number = _whole(topic)
@@ -191,64 +191,64 @@ def _listed(layout: Layout) -> str:
 
 
 def _events(layout: Layout, number: int, size: tuple[int, int]) -> Chunks:
-    layout = replace(layout, trouble=layout.trouble.anew("events"))
-    return joined(_pieces(layout, number), size, where=layout.path, trouble=layout.trouble)
+    layout = replace(layout, log=layout.log.start("events"))
+    return merge_chunks(_raw_chunks(layout, number), size, where=layout.path, log=layout.log)
 
 
-def _pieces(layout: Layout, number: int) -> Iterator[RawChunk]:
+def _raw_chunks(layout: Layout, number: int) -> Iterator[RawChunk]:
     for table in _packets(layout, [number], "EVTS"):
         try:
             stored = table.vector(0, EVENT.itemsize)
-        except Damaged:
-            layout.trouble.note("damaged packets")
+        except DamagedData:
+            layout.log.note("damaged packets")
             continue
         words = np.require(np.frombuffer(stored, np.int64), requirements="A")
         yield RawChunk(*_columns(words.reshape(-1, 2)))
 
 
 def _frames(layout: Layout, number: int) -> Iterator[Frame]:
-    layout = replace(layout, trouble=layout.trouble.anew("frames"))
+    layout = replace(layout, log=layout.log.start("frames"))
     last_us: int | None = None
     for table in _packets(layout, [number], "FRME"):
         try:
-            frame = _frame(table, layout.trouble)
-        except Damaged:
-            layout.trouble.note("damaged frames")
+            frame = _frame(table, layout.log)
+        except DamagedData:
+            layout.log.note("damaged frames")
             continue
         if frame is not None and (last_us is None or frame.open_us >= last_us):
             last_us = frame.open_us
             yield frame
         elif frame is not None:
-            layout.trouble.note("frames earlier than those before them")
+            layout.log.note("frames earlier than those before them")
 
 
-def _frame(table: Table, trouble: ReadLog) -> Frame | None:
-    """The image, or None if it is not one of the whole sensor."""
+def _frame(table: Table, log: ReadLog) -> Frame | None:
+    """Decode a frame; None if it is none of the whole sensor."""
     if table.number(12, "b") in MADE_FROM_EVENTS:
-        trouble.note("frames made from events")
+        log.note("frames made from events")
         return None
     if table.number(8, "h") or table.number(9, "h"):
-        trouble.note("frames of a part of the sensor")
+        log.note("frames of a part of the sensor")
         return None
     width, height, pixels = table.number(6, "h"), table.number(7, "h"), table.number(5, "b")
     if pixels not in PIXELS or width <= 0 or height <= 0:
-        raise Damaged(f"{width} x {height} pixels of type {pixels}")
+        raise DamagedData(f"{width} x {height} pixels of type {pixels}")
     kind, channels = PIXELS[pixels]
     stored = np.frombuffer(table.vector(10, 1), np.uint8)
     if len(stored) != width * height * channels * np.dtype(kind).itemsize:
-        raise Damaged("another number of pixels")
+        raise DamagedData("another number of pixels")
     image = stored.view(kind).reshape(height, width, channels)
     image = image[..., 0] if channels == 1 else image[..., 2::-1]
     taken, opened, closed = (table.number(i, "q") for i in (0, 3, 4))
     if not opened and not closed:
         opened, closed = taken, taken + table.number(11, "q")
     if closed < opened:
-        raise Damaged("an exposure that ends before it begins")
+        raise DamagedData("an exposure that ends before it begins")
     return Frame(image.astype(kind[-2:]), opened, closed)
 
 
 def _triggers(layout: Layout, numbers: Sequence[int]) -> Triggers:
-    layout = replace(layout, trouble=layout.trouble.anew("triggers"))
+    layout = replace(layout, log=layout.log.start("triggers"))
     found: list[tuple[int, int, int]] = []
     for packet in _packets(layout, numbers, "TRIG"):
         try:
@@ -256,31 +256,31 @@ def _triggers(layout: Layout, numbers: Sequence[int]) -> Triggers:
                 edge = EDGES.get(table.number(1, "b"))
                 if edge is not None:
                     found.append((table.number(0, "q"), *edge))
-        except Damaged:
-            layout.trouble.note("damaged packets")
+        except DamagedData:
+            layout.log.note("damaged packets")
     t_us, edge, channel = zip(*found, strict=True) if found else ((), (), ())
     return Triggers(np.array(t_us, np.int64), np.array(edge, np.int8), np.array(channel, np.uint8))
 
 
 def _packets(layout: Layout, numbers: Sequence[int], name: str) -> Iterator[Table]:
-    """The sound packets of some streams; the others are passed over unread."""
+    """Valid packets of some streams; others are skipped without reading them."""
     with layout.path.open("rb") as file:
-        place = file.seek(layout.begin)
-        while place < layout.end:
+        offset = file.seek(layout.begin)
+        while offset < layout.end:
             start = file.read(8)
             number, size = struct.unpack("<ii", start) if len(start) == 8 else (-1, -1)
-            place += 8 + size
-            if number not in layout.streams or size < 0 or place > layout.end:
-                # Without its size, nobody knows where the next packet begins.
-                layout.trouble.note("torn ends of the file")
+            offset += 8 + size
+            if number not in layout.streams or size < 0 or offset > layout.end:
+                # Without the size, the start of the next packet is unknown.
+                layout.log.note("truncated ends of the file")
                 return
             if number not in numbers:
-                file.seek(place)
+                file.seek(offset)
                 continue
             try:
-                table = root(unpacked(file.read(size), layout.packing), name)
-            except Damaged:
-                layout.trouble.note("damaged packets")
+                table = root(decompress(file.read(size), layout.compression), name)
+            except DamagedData:
+                layout.log.note("damaged packets")
                 continue
             yield table
 
@@ -288,7 +288,7 @@ def _packets(layout: Layout, numbers: Sequence[int], name: str) -> Iterator[Tabl
 @njit(cache=True, nogil=True)
 @no_type_check
 def _columns(words):
-    """x, y, t and p of events; four times as fast as taking one column after the other."""
+    """x, y, t and p of events; four times as fast as copying one column after the other."""
     x, y = np.empty(len(words), np.uint16), np.empty(len(words), np.uint16)
     t_us, p = np.empty(len(words), np.int64), np.empty(len(words), np.int8)
     for i in range(len(words)):

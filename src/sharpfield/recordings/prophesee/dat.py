@@ -1,14 +1,14 @@
-"""Prophesee's DAT files: a header of text, a type, then eight bytes per event.
+"""Prophesee's DAT files: a text header, a record type, then eight bytes per event.
 
     type, 1 byte    0 or 12: events; 14: trigger edges
     size, 1 byte    8
-    records         u32 time in us, u32 with the place and the polarity
+    records         u32 time in us, u32 with the pixel and the polarity
 
     version 2       x in bits 0-13, y in 14-27, polarity in 28-31
     version 1       x in bits 0-8, y in 9-16, polarity in 17
     trigger edges   edge in bits 0-3, channel in 26-31
 
-Times wrap after 71 minutes. Older files name neither the version nor the size of the sensor.
+Times wrap after 71 minutes. Older files give neither the version nor the sensor resolution.
 
 Source: Prophesee, *DAT file format* (Metavision documentation).
 """
@@ -22,55 +22,55 @@ import numpy as np
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import blocks, head
-from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.bytes import read_blocks, read_head
+from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
-from sharpfield.recordings.prophesee.evt_decode import is_lone, step
-from sharpfield.recordings.prophesee.header import Header, names_evt, read_header, stated_size
+from sharpfield.recordings.prophesee.evt_decode import is_outlier, wrapped_step
+from sharpfield.recordings.prophesee.header import Header, header_size, names_evt, read_header
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EVENTS, EDGES = (0, 12), 14
-"""Types of records."""
+"""Record types."""
 
 RECORD = 8
-"""Bytes of one."""
+"""Bytes of a record."""
 
-NEAR_US = 2**28
-"""A time that is further (4.5 minutes) from the one before has to be confirmed by the next."""
+MAX_STEP_US = 2**28
+"""A time further from the previous one than this (4.5 minutes) must be confirmed by the next."""
 
-PLACES = {1: (9, 8, 1), 2: (14, 14, 4)}
-"""Bits of x, y and polarity by version."""
+BIT_WIDTHS = {1: (9, 8, 1), 2: (14, 14, 4)}
+"""Bits of x, y and polarity, by version."""
 
-STARTED, TIME, LONE = range(3)
-"""What is remembered: whether there was a time, the last one, and how many were left out."""
+STARTED, TIME, OUTLIERS = range(3)
+"""Decoder state: whether there was a time, the last time, and the number of outliers dropped."""
 
 
 def open_dat(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a DAT file.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`, where the header does not give it.
 
     Raises:
-        CaptureError: It is no such file, or the size is not known.
+        CaptureError: The file is no DAT recording, or its resolution is unknown.
     """
     path = Path(path)
     header = read_header(path)
     edges = _kind(header, path) == EDGES
-    stated = stated_size(header, path, options.size)
-    size = stated or options.size if edges else known_size(stated, options.size, path)
+    stated = header_size(header, path, options.size)
+    size = stated or options.size if edges else resolve_size(stated, options.size, path)
     version = 2 if (header.number("version") or 0) >= 2 else 1
-    trouble = ReadLog()
+    log = ReadLog()
 
     def records() -> Iterator[bytes]:
-        return blocks(path, header.length + 2)
+        return read_blocks(path, header.length + 2)
 
     def events() -> Chunks:
         assert size is not None, "a file of events has a size"
-        noted = trouble.anew("events")
-        pieces = _pieces(records(), PLACES[version], noted)
-        return joined(pieces, size, where=path, trouble=noted)
+        pass_log = log.start("events")
+        raw_chunks = _raw_chunks(records(), BIT_WIDTHS[version], pass_log)
+        return merge_chunks(raw_chunks, size, where=path, log=pass_log)
 
     def triggers() -> Triggers:
         return _edges(b"".join(records()))
@@ -81,14 +81,14 @@ def open_dat(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording
         size=size,
         events=None if edges else events,
         triggers=triggers if edges else None,
-        trouble=trouble,
+        log=log,
         notes=dict(header.fields),
     )
 
 
 def _kind(header: Header, path: Path) -> int:
-    """What the records of a file are."""
-    kind = head(path, header.length + 2)[header.length :]
+    """Record type of a file."""
+    kind = read_head(path, header.length + 2)[header.length :]
     if not header.length or len(kind) < 2:
         raise CaptureError(
             "the file is no DAT recording",
@@ -106,10 +106,10 @@ def _kind(header: Header, path: Path) -> int:
     return kind[0]
 
 
-def _pieces(
-    data: Iterable[bytes], bits: tuple[int, int, int], trouble: ReadLog
+def _raw_chunks(
+    data: Iterable[bytes], bits: tuple[int, int, int], log: ReadLog
 ) -> Iterator[RawChunk]:
-    room, state = Reorder(), np.zeros(3, np.int64)
+    buffer, state = ReorderBuffer(), np.zeros(3, np.int64)
     rest = b""
     for block in chain(data, [None]):
         rest += block or b""
@@ -118,31 +118,31 @@ def _pieces(
         ready = max(len(records) - (block is not None), 0)
         used = 0
         while used < ready:
-            count = min(ready - used, CHUNK - room.end)
-            room.end = _decode(records[used:], count, state, bits, room.columns, room.end)
+            count = min(ready - used, CHUNK - buffer.end)
+            buffer.end = _decode(records[used:], count, state, bits, buffer.columns, buffer.end)
             used += count
-            if room.end == CHUNK:
-                yield room.taken(last=False)
+            if buffer.end == CHUNK:
+                yield buffer.flush(last=False)
         rest = rest[used * RECORD :]
-    trouble.note("torn records", int(len(rest) > 0))
-    trouble.note("times out of line with those before and after", int(state[LONE]))
-    yield room.taken(last=True)
+    log.note("truncated records", int(len(rest) > 0))
+    log.note("times out of line with those before and after", int(state[OUTLIERS]))
+    yield buffer.flush(last=True)
 
 
 def _edges(data: bytes) -> Triggers:
     records = np.frombuffer(data, "<u4", len(data) // RECORD * 2).reshape(-1, 2).astype(np.int64)
-    t_us, place = records.T
+    t_us, word = records.T
     wraps = np.cumsum(np.diff(t_us, prepend=t_us[:1]) < -(2**31))
     t_us = t_us + (wraps << 32)
     order = np.argsort(t_us, kind="stable")
-    edge = np.where(place[order] & 0xF, 1, -1).astype(np.int8)
-    return Triggers(t_us[order], edge, (place[order] >> 26).astype(np.uint8))
+    edge = np.where(word[order] & 0xF, 1, -1).astype(np.int8)
+    return Triggers(t_us[order], edge, (word[order] >> 26).astype(np.uint8))
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _decode(records, count, state, bits, columns, end):
-    """Write the first `count` records from `end` on; how many events there are then."""
+    """Decode `count` records into `columns` from index `end` on; returns the new `end`."""
     x, y, t, p = columns
     e = np.uint64(end)  # unsigned: numba would look for negative indices
     in_x, in_y = (1 << bits[0]) - 1, (1 << bits[1]) - 1
@@ -153,17 +153,17 @@ def _decode(records, count, state, bits, columns, end):
     for i in range(count):
         raw = np.int64(records[i, 0])
         ahead = raw - (time & mask)
-        if ahead < 0 or ahead > NEAR_US:
-            ahead = step(time & mask, raw, mask, NEAR_US)
-            if abs(ahead) > NEAR_US and i + 1 < len(records):
+        if ahead < 0 or ahead > MAX_STEP_US:
+            ahead = wrapped_step(time & mask, raw, mask, MAX_STEP_US)
+            if abs(ahead) > MAX_STEP_US and i + 1 < len(records):
                 following = np.int64(records[i + 1, 0])
-                if is_lone(time & mask, raw, following, mask, NEAR_US):
-                    state[LONE] += 1
+                if is_outlier(time & mask, raw, following, mask, MAX_STEP_US):
+                    state[OUTLIERS] += 1
                     continue
         time += ahead
-        place = np.int64(records[i, 1])
-        x[e], y[e] = place & in_x, (place >> at_y) & in_y
-        t[e], p[e] = time, 1 if (place >> at_p) & in_p else -1
+        word = np.int64(records[i, 1])
+        x[e], y[e] = word & in_x, (word >> at_y) & in_y
+        t[e], p[e] = time, 1 if (word >> at_p) & in_p else -1
         e += np.uint64(1)
     state[STARTED], state[TIME] = 1, time
     return np.int64(e)

@@ -1,7 +1,7 @@
-"""Prophesee's RAW files: a header of text, then words of EVT2, EVT2.1 or EVT3.
+"""Prophesee's RAW files: a text header, then words of EVT2, EVT2.1 or EVT3.
 
-Cameras with this sensor also send the same words in packets over ROS; `decoded` takes them from
-anywhere. Times are those of the camera's clock, which began before the recording.
+Drivers of these cameras also send such words in packets over ROS; `decode_chunks` reads them from
+any source. Times are those of the camera's clock, which started before the recording.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Int64
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.bytes import blocks
-from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.bytes import read_blocks
+from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt_decode import (
+    MAX_PER_WORD,
     NO_ROW,
-    REMEMBERED,
-    ROOM,
     ROW,
     STARTED,
+    STATE_SIZE,
     UNCONFIRMED,
     UNKNOWN,
     UNTIMED,
@@ -29,26 +29,26 @@ from sharpfield.recordings.prophesee.evt_decode import (
     decode_evt3,
     decode_evt21,
 )
-from sharpfield.recordings.prophesee.header import Header, names_evt, read_header, stated_size
+from sharpfield.recordings.prophesee.header import Header, header_size, names_evt, read_header
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
 
 EDGES = 4096
-"""Trigger edges taken over at once."""
+"""Capacity for trigger edges of one call of a decoder."""
 
 LEGACY_BEFORE = 55
-"""Prophesee's cameras with a lower `system_ID` send the halves of EVT2.1 words the other way."""
+"""Cameras by Prophesee with a lower `system_ID` exchange the two halves of EVT2.1 words."""
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """One of Prophesee's ways to write events."""
+    """One of Prophesee's event encodings."""
 
     name: str
     word: str
-    """Type of its words, as numpy names it."""
+    """numpy type of its words."""
     decode: Callable[..., Any]
     swapped: bool = False
-    """Whether the two halves of a word come the other way round."""
+    """Whether the two halves of a word are exchanged."""
 
 
 ENCODINGS = {
@@ -74,73 +74,73 @@ def open_evt(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording
     """Open a RAW file.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`, where the header does not give it; `event_encoding`, one of `ENCODINGS`,
             overrules the header.
 
     Raises:
-        CaptureError: It is no such file, or size or encoding are not known.
+        CaptureError: The file is no RAW recording, or its resolution or encoding is unknown.
     """
     path = Path(path)
     header = read_header(path)
-    chosen = _encoding(header, path, options.event_encoding)
-    size = known_size(stated_size(header, path, options.size), options.size, path)
+    encoding = _encoding(header, path, options.event_encoding)
+    size = resolve_size(header_size(header, path, options.size), options.size, path)
     origin_us = header.number("time_origin_us") or 0
     bayer = header.fields.get("bayer", "")
-    trouble = ReadLog()
+    log = ReadLog()
 
     def words() -> Iterator[bytes]:
-        return blocks(path, header.length)
+        return read_blocks(path, header.length)
 
     def events() -> Chunks:
-        noted = trouble.anew("events")
-        for part in decoded(chosen, words(), size, where=path, trouble=noted):
+        pass_log = log.start("events")
+        for part in decode_chunks(encoding, words(), size, where=path, log=pass_log):
             yield replace(part, t_us=part.t_us + origin_us if origin_us else part.t_us, bayer=bayer)
 
     def triggers() -> Triggers:
-        found = trigger_edges(chosen, words(), where=path)
+        found = decode_triggers(encoding, words(), where=path)
         return replace(found, t_us=found.t_us + origin_us)
 
     return Recording(
         path,
-        ENCODINGS[chosen].name,
+        ENCODINGS[encoding].name,
         size=size,
         events=events,
         triggers=triggers,
         bayer=bayer,
-        trouble=trouble,
+        log=log,
         notes=dict(header.fields),
     )
 
 
-def decoded(
+def decode_chunks(
     encoding: str,
     data: Iterable[bytes],
     size: tuple[int, int],
     *,
     where: object,
-    trouble: ReadLog,
+    log: ReadLog,
 ) -> Chunks:
-    """Events of an encoded stream, cut into blocks anywhere.
+    """Decode the events of a byte stream, which may be cut into blocks anywhere.
 
     Args:
         encoding: One of `ENCODINGS`.
         data: The blocks.
-        size: Width and height of the sensor.
+        size: Sensor resolution, width and height.
         where: The file, for messages.
-        trouble: Is told what was left out.
+        log: Counts what is left out.
 
     Raises:
-        CaptureError: The words are not of this encoding, or times are not in order.
+        CaptureError: The words are not of this encoding, or events are not sorted by time.
     """
-    decoder = _Decoder(ENCODINGS[encoding], where, trouble)
-    return joined(decoder.pieces(data), size, where=where, trouble=trouble)
+    decoder = _Decoder(ENCODINGS[encoding], where, log)
+    return merge_chunks(decoder.raw_chunks(data), size, where=where, log=log)
 
 
-def trigger_edges(encoding: str, data: Iterable[bytes], *, where: object) -> Triggers:
-    """Edges on the trigger inputs, of a stream as `decoded` takes it, in the order of time."""
+def decode_triggers(encoding: str, data: Iterable[bytes], *, where: object) -> Triggers:
+    """Decode the edges on the trigger inputs, sorted by time; see `decode_chunks`."""
     decoder = _Decoder(ENCODINGS[encoding], where, ReadLog())
-    for _ in decoder.pieces(data):
+    for _ in decoder.raw_chunks(data):
         pass
     edges = np.concatenate([np.empty((0, 3), np.int64), *decoder.edges])
     edges = edges[np.argsort(edges[:, 0], kind="stable")]
@@ -148,27 +148,27 @@ def trigger_edges(encoding: str, data: Iterable[bytes], *, where: object) -> Tri
 
 
 class _Decoder:
-    """What goes on from block to block."""
+    """Decodes consecutive blocks; keeps the state between them."""
 
-    def __init__(self, encoding: Encoding, where: object, trouble: ReadLog) -> None:
-        self._encoding, self._where, self._trouble = encoding, where, trouble
-        self._state = np.zeros(REMEMBERED, np.int64)
+    def __init__(self, encoding: Encoding, where: object, log: ReadLog) -> None:
+        self._encoding, self._where, self._log = encoding, where, log
+        self._state = np.zeros(STATE_SIZE, np.int64)
         self._state[ROW] = NO_ROW
         self._words = np.empty(0, encoding.word)
-        self._odd = b""
+        self._partial_word = b""
         self._untimed = 0
-        self._room = Reorder()
-        self._found = np.empty((EDGES, 3), np.int64)
+        self._buffer = ReorderBuffer()
+        self._edges = np.empty((EDGES, 3), np.int64)
         self.edges: list[Int64[np.ndarray, "n 3"]] = []
 
-    def pieces(self, data: Iterable[bytes]) -> Iterator[RawChunk]:
-        """Decode it all."""
+    def raw_chunks(self, data: Iterable[bytes]) -> Iterator[RawChunk]:
+        """Decode all blocks."""
         for block in data:
             self._take(block)
             yield from self._decode(last=False)
         yield from self._decode(last=True)
-        assert not len(self._words), "a decoder leaves nothing where nothing follows"
-        self._trouble.note("torn words", int(len(self._odd) > 0))
+        assert not len(self._words), "a decoder uses all words of the last block"
+        self._log.note("truncated words", int(len(self._partial_word) > 0))
         if self._untimed and not self._state[STARTED]:
             raise CaptureError(
                 f"there are no times in the data, as if they were no {self._encoding.name}",
@@ -176,34 +176,34 @@ class _Decoder:
                 got=f"{self._untimed} events",
                 do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
             )
-        yield self._room.taken(last=True)
+        yield self._buffer.flush(last=True)
 
     def _take(self, block: bytes) -> None:
-        data = self._odd + block if self._odd else block
+        data = self._partial_word + block if self._partial_word else block
         count = len(data) // np.dtype(self._encoding.word).itemsize
         words = np.frombuffer(data, self._encoding.word, count)
-        self._odd = data[words.nbytes :]
+        self._partial_word = data[words.nbytes :]
         if self._encoding.swapped:
             words = words >> np.uint64(32) | words << np.uint64(32)
         self._words = np.concatenate([self._words, words]) if len(self._words) else words
 
     def _decode(self, *, last: bool) -> Iterator[RawChunk]:
-        """Decode the words that are there, and yield whenever the room is full."""
-        decode, room = self._encoding.decode, self._room
+        """Decode the words read so far; yields whenever the buffer is full."""
+        decode, buffer = self._encoding.decode, self._buffer
         while True:
             count = len(self._words)
-            used, room.end, found = decode(
-                self._words, self._state, last, room.columns, room.end, self._found
+            used, buffer.end, found = decode(
+                self._words, self._state, last, buffer.columns, buffer.end, self._edges
             )
             self._words = self._words[used:]
-            self.edges += [self._found[:found].copy()] if found else []
-            self._tell(count)
-            if room.end + ROOM > CHUNK:
-                yield room.taken(last=False)
+            self.edges += [self._edges[:found].copy()] if found else []
+            self._count_dropped(count)
+            if buffer.end + MAX_PER_WORD > CHUNK:
+                yield buffer.flush(last=False)
             elif not used or not len(self._words):
                 return
 
-    def _tell(self, count: int) -> None:
+    def _count_dropped(self, count: int) -> None:
         if self._state[UNKNOWN] > max(count // 4, 16):
             raise CaptureError(
                 f"the data are no {self._encoding.name}",
@@ -212,13 +212,13 @@ class _Decoder:
                 do=f"check the header, or give the encoding: one of {', '.join(ENCODINGS)}",
             )
         self._untimed += int(self._state[UNTIMED])
-        for place, kind in COUNTS.items():
-            self._trouble.note(kind, int(self._state[place]))
-            self._state[place] = 0
+        for index, kind in COUNTS.items():
+            self._log.note(kind, int(self._state[index]))
+            self._state[index] = 0
 
 
 def _encoding(header: Header, path: Path, given: str | None) -> str:
-    """Which of `ENCODINGS` a file has."""
+    """Which of `ENCODINGS` a file uses."""
     if given is not None:
         if given not in ENCODINGS:
             raise OptionError(
@@ -245,7 +245,7 @@ def _encoding(header: Header, path: Path, given: str | None) -> str:
 
 
 def _halves_swapped(header: Header, path: Path) -> bool:
-    """Whether EVT2.1 words come with their upper half first, as from an IMX636."""
+    """Whether EVT2.1 words have their upper half first, as from an IMX636."""
     order = header.format.get("endianness") or header.fields.get("endianness")
     if order in ("little", "legacy"):
         return order == "legacy"

@@ -1,4 +1,4 @@
-"""Prophesee's event encodings, decoded word by word with what earlier words left behind.
+"""Decoders of Prophesee's event encodings EVT2, EVT2.1 and EVT3, in compiled loops over words.
 
     EVT2    32-bit words: one event, or the high part of the time, or a trigger edge
     EVT2.1  64-bit words: up to 32 neighbours of one row, or as above
@@ -7,9 +7,9 @@
 Vocabulary: the *counter* is the high part of the time as a word holds it, which wraps; `HIGH` is
 the same unwrapped. Times are in us: the counter counts 64 us (EVT2, EVT2.1) or 4096 us (EVT3).
 
-A decoder is a loop over words that keeps all it knows in an array of numbers, so that a file may
-be cut into blocks anywhere. It stops early when there is no room for what it finds, or when it
-has to see the words after a block to judge one in it (see `is_lone`).
+A decoder is a loop over words that keeps its state in an array of numbers, so that a file may be
+cut into blocks anywhere. It stops early when the output is full, or when it needs the words after
+a block to judge one in it (see `is_outlier`).
 
 Source: Prophesee, *EVT 2.0*, *EVT 2.1* and *EVT 3.0 format* (Metavision documentation). A new
 counter in EVT3 sets the low part to zero until its own word comes, a repeated one does not.
@@ -21,50 +21,50 @@ import numpy as np
 from numba import njit
 
 HIGH, STARTED, LOW, ROW, BASE, SIGN, UNTIMED, UNCONFIRMED, UNKNOWN = range(9)
-"""What a decoder remembers: the unwrapped counter and whether there was one; of EVT3 the low time,
-row (or `NO_ROW`), column and polarity of the next vector; and counts of what was left out."""
+"""Decoder state: the unwrapped counter and whether there was one; for EVT3 the low time, row (or
+`NO_ROW`), column and polarity of the next vector; and counts of what was left out."""
 
-REMEMBERED = 9
-"""How many numbers that is."""
+STATE_SIZE = 9
+"""Length of the state array."""
 
 NO_ROW, OTHER_ROW = -1, -2
-"""No row yet, and a row of exposure measurements, which are no events."""
+"""No row yet; and a row of exposure measurements, which are no events."""
 
-ROOM = 32
+MAX_PER_WORD = 32
 """Most events that one word can hold."""
 
-NEAR_US = 2**18
-"""The counter normally goes on by less than this: cameras write it every few us."""
+MAX_STEP_US = 2**18
+"""The counter normally advances by less than this: cameras write it every few us."""
 
-LOOK = 2**16
-"""How many words ahead a counter is confirmed."""
+LOOKAHEAD = 2**16
+"""Within how many words the next counter is searched to confirm one."""
 
 DE_BRUIJN = 0x077CB531
 LOWEST = np.zeros(32, np.int64)
-"""Number of the lowest set bit of a 32-bit word w, at `(w & -w) * DE_BRUIJN >> 27`."""
+"""Index of the lowest set bit of a 32-bit word w, at `(w & -w) * DE_BRUIJN >> 27`."""
 LOWEST[[(DE_BRUIJN << k & 0xFFFFFFFF) >> 27 for k in range(32)]] = np.arange(32)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def decode_evt2(words, state, last, columns, end, edges):
-    """EVT2, from 32-bit words.
+    """Decode EVT2, from 32-bit words.
 
     Args:
         words: The next words.
-        state: `REMEMBERED` numbers, zero at first but for `ROW` = `NO_ROW`; updated.
+        state: `STATE_SIZE` numbers, initially zero except `ROW` = `NO_ROW`; updated.
         last: Whether no words follow these.
-        columns: x, y, t and p, written from `end` on.
-        end: How many events there are already.
-        edges: Rows of time, edge and channel, written from the first on.
+        columns: x, y, t and p, written from index `end` on.
+        end: Number of events in the columns.
+        edges: Rows of time, edge and channel, written from index 0 on.
 
     Returns:
-        How many words were used up, events there are now, and edges were found.
+        Number of words used, of events in the columns, and of edges found.
     """
     x, y, t, p = columns
     e, found = np.uint64(end), 0
     high, live = state[HIGH] << 6, state[STARTED] > 0
-    most = min(words.size, t.size - ROOM + 1 - end)
+    most = min(words.size, t.size - MAX_PER_WORD + 1 - end)
     for i in range(most):
         word = np.int64(words[i])
         kind = word >> 28
@@ -92,8 +92,8 @@ def decode_evt2(words, state, last, columns, end, edges):
 @njit(cache=True, nogil=True)
 @no_type_check
 def decode_evt21(words, state, last, columns, end, edges):
-    """EVT2.1, from 64-bit words with the type on top; see `decode_evt2`."""
-    limit = columns[2].size - ROOM
+    """Decode EVT2.1, from 64-bit words with the type in the top bits; see `decode_evt2`."""
+    limit = columns[2].size - MAX_PER_WORD
     found = 0
     high, live = state[HIGH] << 6, state[STARTED] > 0
     for i in range(words.size):
@@ -126,9 +126,9 @@ def decode_evt21(words, state, last, columns, end, edges):
 @njit(cache=True, nogil=True)
 @no_type_check
 def decode_evt3(words, state, last, columns, end, edges):
-    """EVT3, from 16-bit words; see `decode_evt2`."""
+    """Decode EVT3, from 16-bit words; see `decode_evt2`."""
     x, y, t, p = columns
-    limit = t.size - ROOM
+    limit = t.size - MAX_PER_WORD
     used, found = words.size, 0
     row, base, sign = state[ROW], state[BASE], state[SIGN]
     time = state[HIGH] << 12 | state[LOW]
@@ -216,19 +216,19 @@ def _ones(bits):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _advance(words, i, state, last, kind_at, counter_at):
-    """Take over the counter of word i. False if words after these are needed to judge it."""
+    """Update the state with the counter of word i; False if later words are needed to judge it."""
     mask = 0xFFF if kind_at == 12 else 0xFFFFFFF
-    near = NEAR_US >> (12 if kind_at == 12 else 6)
+    near = MAX_STEP_US >> (12 if kind_at == 12 else 6)
     counter = (np.int64(words[i]) >> counter_at) & mask
     if not state[STARTED]:
         state[HIGH], state[STARTED] = counter, 1
         return True
-    ahead = step(state[HIGH] & mask, counter, mask, near)
+    ahead = wrapped_step(state[HIGH] & mask, counter, mask, near)
     if abs(ahead) > near:
         following = _following(words, i, last, kind_at, counter_at, mask)
         if following == -2:
             return False
-        if following >= 0 and is_lone(state[HIGH] & mask, counter, following, mask, near):
+        if following >= 0 and is_outlier(state[HIGH] & mask, counter, following, mask, near):
             state[UNCONFIRMED] += 1
             return True
     state[HIGH] += ahead
@@ -237,8 +237,8 @@ def _advance(words, i, state, last, kind_at, counter_at):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def step(before, counter, mask, near):
-    """How far a counter went on, or back (negative), wraps undone."""
+def wrapped_step(before, counter, mask, near):
+    """Change of a counter, negative if it went back; wraps are undone."""
     ahead = (counter - before) & mask
     back = mask + 1 - ahead
     if ahead <= back or (back > near and counter > before):
@@ -248,20 +248,20 @@ def step(before, counter, mask, near):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def is_lone(before, counter, following, mask, near):
-    """Whether a counter is a lone outlier: the next one goes on from the one before.
+def is_outlier(before, counter, following, mask, near):
+    """Whether a counter is a single outlier: the next one continues from the one before.
 
-    One wrong bit would otherwise make time jump and, once it jumps back, pass for a wrap.
+    Otherwise one wrong bit would make time jump, and the jump back would pass for a wrap.
     """
-    goes_on = abs(step(before, following, mask, near)) <= near
-    return goes_on and abs(step(counter, following, mask, near)) > near
+    continues = abs(wrapped_step(before, following, mask, near)) <= near
+    return continues and abs(wrapped_step(counter, following, mask, near)) > near
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _following(words, i, last, kind_at, counter_at, mask):
-    """The next counter within `LOOK` words; -1 if there is none, -2 if these words are too few."""
-    for j in range(i + 1, min(i + LOOK, words.size)):
+    """The next counter within `LOOKAHEAD` words; -1 if none, -2 if more words are needed."""
+    for j in range(i + 1, min(i + LOOKAHEAD, words.size)):
         if (np.uint64(words[j]) >> np.uint64(kind_at)) == 8:
             return (np.int64(words[j]) >> counter_at) & mask
-    return -1 if last or i + LOOK <= words.size else -2
+    return -1 if last or i + LOOKAHEAD <= words.size else -2

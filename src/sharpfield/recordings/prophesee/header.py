@@ -1,8 +1,9 @@
-"""The text at the beginning of Prophesee's files: lines of `% keyword value`.
+"""Header of Prophesee's files: text lines of `% keyword value`.
 
-It ends where a line does not begin so, or after `% end`. Older files say neither their size nor
-their encoding in full; then the camera does, by the name of its plug-in or its number. Programs
-differ in capitals, in blanks, and in how they write a size; all of it is read.
+The header ends at the first line that does not begin with `%`, or after `% end`. Older files give
+neither the sensor resolution nor the encoding in full; the camera model then decides, by the name
+of its plug-in or its number. Programs differ in capitals, in spaces, and in how they write a
+resolution; all variants are read.
 
 Source: Prophesee, *RAW file format* and *DAT file format* (Metavision documentation).
 """
@@ -12,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import head
+from sharpfield.recordings.bytes import read_head
 
-LONGEST, WHOLE = 1024, 2**16
+MAX_LINE, MAX_HEADER = 1024, 2**16
 """Most bytes of a line and of a header."""
 
 GEOMETRY = r"([0-9]{1,5}) *[xX,*] *([0-9]{1,5})"
-"""How programs write a size."""
+"""How programs write a resolution."""
 
 SIZES = {
     "genx320": (320, 320),
@@ -29,7 +30,7 @@ SIZES = {
     "gen4": (1280, 720),
     "gen3": (640, 480),
 }
-"""Width and height by what a plug-in's name contains."""
+"""Width and height by a part of the plug-in name."""
 
 SYSTEMS = {
     **dict.fromkeys((21, 23, 25, 28, 29, 33, 34, 35, 40, 41), (640, 480)),
@@ -37,7 +38,7 @@ SYSTEMS = {
     **dict.fromkeys((52, 54), (640, 512)),
     64: (320, 320),
 }
-"""Width and height by `system_ID`, of Prophesee's own cameras."""
+"""Width and height by `system_ID`, for cameras made by Prophesee."""
 
 
 def names_evt(head: bytes) -> bool:
@@ -49,15 +50,15 @@ def names_evt(head: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Header:
-    """What the text says."""
+    """A parsed header."""
 
     fields: dict[str, str]
-    """By keywords in small letters."""
+    """Values by keyword in small letters."""
     length: int
-    """Bytes of it; the data begin there."""
+    """Bytes of the header; the data begin there."""
 
     def number(self, *names: str) -> int | None:
-        """The first of these fields that is a whole number, or begins with one, as 2.0 does."""
+        """The first of these fields that is a whole number or begins with one, as "2.0" does."""
         for name in names:
             if match := re.fullmatch(r"(-?[0-9]{1,18})(\.[0-9]*)?", self.fields.get(name, "")):
                 return int(match[1])
@@ -65,25 +66,25 @@ class Header:
 
     @property
     def format(self) -> dict[str, str]:
-        """The parts of `format`, e.g. {"": "EVT3", "height": "720", "width": "1280"}."""
+        """The parts of the field `format`, e.g. {"": "EVT3", "height": "720", "width": "1280"}."""
         name, *options = self.fields.get("format", "").split(";")
         pairs = [option.partition("=") for option in options]
         return {"": name.strip()} | {key.strip().lower(): value.strip() for key, _, value in pairs}
 
 
 def read_header(path: Path) -> Header:
-    """The header of a file; it has no fields if there is none.
+    """Read the header of a file; without a header there are no fields.
 
     Raises:
         CaptureError: The file cannot be read.
     """
-    data = head(path, WHOLE)
+    data = read_head(path, MAX_HEADER)
     fields: dict[str, str] = {}
     at = 0
     while data[at : at + 1] == b"%":
-        stop = data.find(b"\n", at, at + LONGEST)
-        if stop < 0 and len(data) < WHOLE:
-            stop = len(data)  # nothing follows a header whose last line does not end
+        stop = data.find(b"\n", at, at + MAX_LINE)
+        if stop < 0 and len(data) < MAX_HEADER:
+            stop = len(data)  # the header is all there is, and its last line is not terminated
         line = _text(data[at + 1 : stop]) if stop >= 0 else None
         if line is None:
             break
@@ -95,16 +96,16 @@ def read_header(path: Path) -> Header:
     return Header(fields, at)
 
 
-def stated_size(
+def header_size(
     header: Header, path: Path, given: tuple[int, int] | None
 ) -> tuple[int, int] | None:
-    """Width and height as the header says, or as the camera has that it names; else None.
+    """Resolution from the header, or from the camera model that it names; None if unknown.
 
     Args:
-        header: Of the file.
-        path: Of the file, for the message.
-        given: What the caller says: it decides where the header only names a camera, or names
-            several sizes.
+        header: Header of the file.
+        path: The file, for the message.
+        given: Resolution from the caller: it decides where the header only names a camera model,
+            or gives several resolutions.
 
     Raises:
         CaptureError: The header contradicts itself.
@@ -139,7 +140,7 @@ def _size_of_camera(header: Header) -> tuple[int, int] | None:
 
 
 def _text(line: bytes) -> str | None:
-    """The line, or None if it is data: these hold bytes that no text does."""
+    """The text of a line; None for binary data, which holds unprintable bytes."""
     try:
         text = line.decode("utf-8")
     except UnicodeDecodeError:

@@ -1,14 +1,11 @@
-"""Messages of events, as drivers of event cameras send them over ROS.
+"""ROS messages of events and of images, decoded.
 
-    dvs_msgs, prophesee_event_msgs   EventArray: size of the sensor; x, y, time and polarity of each
-    event_camera_msgs                EventPacket: size of the sensor, an encoding, and the payload
-                                     as the camera sent it
+    dvs_msgs, prophesee_event_msgs   EventArray: resolution; x, y, time and polarity of each event
+    event_camera_msgs                EventPacket: resolution, encoding, and the payload as the
+                                     camera sent it
+    sensor_msgs                      Image: plain pixels; CompressedImage: PNG or JPEG
 
-Source: the message definitions of these packages.
-
-Images as ROS sends them, plain (`sensor_msgs/Image`) or as PNG or JPEG (`CompressedImage`).
-
-Source: the message definitions of `sensor_msgs`, and `image_encodings.h` for names of pixels.
+Source: the message definitions of these packages, and `image_encodings.h` for pixel formats.
 """
 
 from collections.abc import Iterable, Iterator
@@ -19,14 +16,14 @@ import numpy as np
 from jaxtyping import Shaped
 from numba import njit
 
-from sharpfield.recordings.bytes import Damaged
-from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder
+from sharpfield.recordings.bytes import DamagedData
+from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer
 from sharpfield.recordings.recording import ReadLog
-from sharpfield.recordings.ros.bag import Fields, Message, Topic
+from sharpfield.recordings.ros.bag import FieldReader, Message, Topic
 
 ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
-"""The second is what the first was called before."""
+"""The second is an earlier name of the first."""
 
 EVENT = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("on", "u1")])
 PADDED_EVENT = np.dtype(
@@ -37,87 +34,87 @@ PADDED_EVENT = np.dtype(
         "itemsize": 16,
     }
 )
-"""In ROS 2 numbers are aligned, and so every event but the first has three bytes of padding."""
+"""ROS 2 aligns numbers, so every event but the first is preceded by three bytes of padding."""
 
 
-class Start(NamedTuple):
-    """What an event message says before its events."""
+class EventHeader(NamedTuple):
+    """Fields that all event messages begin with."""
 
     stamp_ns: int
     size: tuple[int, int]
 
 
 class Packet(NamedTuple):
-    """Encoded events."""
+    """Encoded events of one message."""
 
     stamp_ns: int
-    """When the first of them reached the driver."""
+    """When the first event reached the driver."""
     base_ns: int
-    """What their times count from, in some encodings."""
+    """Origin of the event times, in some encodings."""
     encoding: str
     payload: memoryview
 
 
-def start(fields: Fields) -> Start:
-    """Time and size of the sensor, with which all messages of events begin."""
+def event_header(fields: FieldReader) -> EventHeader:
+    """Read time and sensor resolution, with which all event messages begin."""
     stamp_ns = fields.header_ns()
     height, width = fields.number("I"), fields.number("I")
-    return Start(stamp_ns, (width, height))
+    return EventHeader(stamp_ns, (width, height))
 
 
-def event_arrays(messages: Iterable[Message], topic: Topic, trouble: ReadLog) -> Iterator[RawChunk]:
-    """The events of consecutive messages of `ARRAYS`, decoded right to where they stay."""
-    room = Reorder()
+def event_arrays(messages: Iterable[Message], topic: Topic, log: ReadLog) -> Iterator[RawChunk]:
+    """Decode the events of consecutive messages of types `ARRAYS`."""
+    buffer = ReorderBuffer()
     for message in messages:
         try:
             parts = _stored(message, topic)
-        except Damaged:
-            trouble.note("damaged messages")
+        except DamagedData:
+            log.note("damaged messages")
             continue
         for events in parts:
             done = 0
             while done < len(events):
-                count = min(len(events) - done, CHUNK - room.end)
-                room.end = _decode(events[done : done + count], room.columns, room.end)
+                count = min(len(events) - done, CHUNK - buffer.end)
+                buffer.end = _decode(events[done : done + count], buffer.columns, buffer.end)
                 done += count
-                if room.end == CHUNK:
-                    yield room.taken(last=False)
-    yield room.taken(last=True)
+                if buffer.end == CHUNK:
+                    yield buffer.flush(last=False)
+    yield buffer.flush(last=True)
 
 
 def event_packet(message: Message, topic: Topic) -> Packet:
-    """The payload of a message of `PACKETS`.
+    """Payload of a message of types `PACKETS`.
 
     Raises:
-        Damaged: It is torn.
+        DamagedData: The message is truncated.
     """
-    fields = Fields(message, topic)
-    stamp_ns, _ = start(fields)
+    fields = FieldReader(message, topic)
+    stamp_ns, _ = event_header(fields)
     fields.number("Q")
     base_ns = fields.number("Q")
     encoding = fields.text()
     fields.number("B")
     if base_ns >= 2**62:
-        raise Damaged("a time that lies centuries ahead")
+        raise DamagedData("a time that lies centuries ahead")
     return Packet(stamp_ns, base_ns, encoding, fields.take(fields.number("I")))
 
 
 def _stored(message: Message, topic: Topic) -> list[np.ndarray]:
-    """The events of a message as they are there, in one or two parts."""
-    fields = Fields(message, topic)
-    start(fields)
+    """Events of a message as stored, in one or two arrays."""
+    fields = FieldReader(message, topic)
+    event_header(fields)
     count = fields.number("I")
     if not topic.cdr or not count:
         return [np.frombuffer(fields.take(13 * count), EVENT)]
     first = np.frombuffer(fields.take(13), EVENT)
-    # The last one is not padded, as nothing follows.
+    # The last event is not padded, as nothing follows.
     return [first, np.frombuffer(fields.take(16 * (count - 1)), PADDED_EVENT)]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _decode(events, columns, end):
-    """Write events from `end` on; how many there are then."""
+    """Decode events into `columns` from index `end` on; returns the new `end`."""
     x, y, t, p = columns
     e = np.uint64(end)  # unsigned: numba would look for negative indices
     for i in range(events.size):
@@ -151,52 +148,52 @@ PIXELS: dict[str, tuple[type[np.unsignedinteger], int, str]] = {
         for bits, kind in (("8", np.uint8), ("16", np.uint16))
     },
 }
-"""Type and channels of a pixel, and the order of colours, or the tile of filters before them."""
+"""Data type and channels of a pixel, and the order of its colours or the colour filter array."""
 
 
-class Image(NamedTuple):
-    """A image and its time."""
+class StampedImage(NamedTuple):
+    """A decoded image and its time."""
 
     stamp_ns: int
     image: Shaped[np.ndarray, "h w *c"]
     bayer: str
 
 
-def image(message: Message, topic: Topic) -> Image:
-    """The image of a message.
+def decode_image(message: Message, topic: Topic) -> StampedImage:
+    """Decode an image message.
 
     Raises:
-        Damaged: It is torn, or its pixels are of no known type.
+        DamagedData: The message is truncated, or its pixel format is unknown.
     """
-    fields = Fields(message, topic)
+    fields = FieldReader(message, topic)
     stamp_ns = fields.header_ns()
     if topic.kind == COMPRESSED:
         fields.text()
-        return Image(stamp_ns, _unpacked(fields.take(fields.number("I"))), "")
+        return StampedImage(stamp_ns, _decompressed(fields.take(fields.number("I"))), "")
     height, width = fields.number("I"), fields.number("I")
     encoding, big_endian, step = fields.text(), fields.number("B"), fields.number("I")
     data = np.frombuffer(fields.take(fields.number("I")), np.uint8)
     if encoding not in PIXELS:
-        raise Damaged(f"pixels of type {encoding!r}")
+        raise DamagedData(f"pixels of type {encoding!r}")
     kind, channels, colours = PIXELS[encoding]
     row = width * channels * np.dtype(kind).itemsize
     if not (height and width) or row > step or height * step > len(data):
-        raise Damaged("a torn image")
+        raise DamagedData("a truncated image")
     stored = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     pixels = stored.view(np.dtype(kind).newbyteorder(">" if big_endian else "<"))
     found = pixels.astype(kind).reshape(height, width, channels)
     if channels == 1:
-        return Image(stamp_ns, found[..., 0], colours)
-    return Image(stamp_ns, found[..., :3] if colours == "RGB" else found[..., 2::-1], "")
+        return StampedImage(stamp_ns, found[..., 0], colours)
+    return StampedImage(stamp_ns, found[..., :3] if colours == "RGB" else found[..., 2::-1], "")
 
 
-def _unpacked(data: memoryview) -> Shaped[np.ndarray, "h w *c"]:
+def _decompressed(data: memoryview) -> Shaped[np.ndarray, "h w *c"]:
     if not len(data):
-        raise Damaged("an empty image")
+        raise DamagedData("an empty image")
     try:
         found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise Damaged(str(error)) from None
+        raise DamagedData(str(error)) from None
     if found is None or found.dtype not in (np.uint8, np.uint16):
-        raise Damaged("no image")
+        raise DamagedData("no image")
     return found if found.ndim == 2 else np.ascontiguousarray(found[..., 2::-1])

@@ -1,12 +1,12 @@
-"""Payloads of `event_camera_msgs` other than Prophesee's: `libcaer_cmp`, `libcaer`, `mono`.
+"""Payloads of `event_camera_msgs` that are not Prophesee's: `libcaer_cmp`, `libcaer`, `mono`.
 
-    libcaer_cmp  words of 16 bits, the kind above: 0 time, upper 12 bits · 1 time, lower 12 bits
+    libcaer_cmp  16-bit words, type in the top 4 bits: 0 time, upper 12 bits · 1 time, lower 12 bits
                  (us, within the packet) · 2 x, 11 bits · 3 y and, in bit 11, polarity: an event
                  · 4 y and polarity of events to follow · 5 which of 8 rows from there have one
     libcaer      8 bytes: valid · polarity · y, 15 bits · x, 15 bits; and 31 bits of us
     mono         8 bytes: 32 bits of ns · x, 16 bits · y, 15 bits · polarity
 
-All count from the `time_base` of their packet, in ns.
+All times count from the `time_base` of their packet, in ns.
 
 Source: the package event_camera_codecs of the ros-event-camera project.
 """
@@ -22,16 +22,16 @@ ENCODINGS = ("libcaer_cmp", "libcaer", "mono")
 
 
 def decode(encoding: str, payload: memoryview, base_ns: int) -> RawChunk:
-    """The events of a packet.
+    """Decode the events of a packet.
 
     Args:
         encoding: One of `ENCODINGS`.
-        payload: A torn word at its end is left out.
+        payload: The encoded events; a truncated word at the end is left out.
         base_ns: `time_base` of the packet.
     """
     if encoding == "libcaer_cmp":
         words = np.frombuffer(payload, "<u2", len(payload) // 2)
-        *columns, count = _compressed(words, base_ns, _most(words))
+        *columns, count = _compressed(words, base_ns, _max_events(words))
         return RawChunk(*columns)[:count]
     words = np.frombuffer(payload, "<u4", len(payload) // 8 * 2).reshape(-1, 2)
     return RawChunk(*(_plain if encoding == "libcaer" else _mono)(words, base_ns))
@@ -39,8 +39,8 @@ def decode(encoding: str, payload: memoryview, base_ns: int) -> RawChunk:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _most(words):
-    """How many events there are at most."""
+def _max_events(words):
+    """Upper bound of the number of events."""
     count = 0
     for i in range(words.size):
         kind = words[i] >> 12

@@ -1,8 +1,8 @@
-"""MCAP files, which ROS 2 writes by default, read from the front: torn ones are read, too.
+"""MCAP files, the default of ROS 2, read from the front; truncated files are read, too.
 
-A *record* is its kind, its length and its content. A *chunk* holds other records, perhaps
-compressed. A *schema* names a type, a *channel* ties a number to a topic and its schema. The
-summary at the end is used only to learn of all channels at once.
+A *record* is a type, a length and the content. A *chunk* holds other records, possibly compressed.
+A *schema* names a message type, a *channel* maps a number to a topic and its schema. The summary at
+the end is used only to find the channels.
 
 Source: https://mcap.dev/spec.
 """
@@ -12,9 +12,17 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import LIMIT, Bytes, Damaged, head, unpacked
+from sharpfield.recordings.bytes import MAX_BLOCK, Bytes, DamagedData, decompress, read_head
 from sharpfield.recordings.recording import ReadLog
-from sharpfield.recordings.ros.bag import Bag, Message, Read, Topic, of_file, of_part, topic_of
+from sharpfield.recordings.ros.bag import (
+    Bag,
+    Message,
+    ReadBytes,
+    Topic,
+    file_reader,
+    memory_reader,
+    topic_of,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
@@ -28,15 +36,15 @@ def open_mcap(path: Path) -> Bag:
     """Open a file.
 
     Raises:
-        CaptureError: It is no MCAP.
+        CaptureError: The file is no MCAP.
     """
-    if head(path, len(MAGIC)) != MAGIC:
+    if read_head(path, len(MAGIC)) != MAGIC:
         raise CaptureError("the file is no MCAP", where=path)
     channels = _summarised(path) or _channels(_records(path, len(MAGIC), ReadLog()))
 
-    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
+    def messages(wanted: Collection[str], log: ReadLog) -> Iterator[Message]:
         numbers = {n: name for n, (name, _) in channels.items() if name in wanted}
-        for kind, content in _records(path, len(MAGIC), trouble):
+        for kind, content in _records(path, len(MAGIC), log):
             if kind == MESSAGE and len(content) >= 22:
                 number, _, logged_ns = struct.unpack_from("<HIQ", content)
                 if number in numbers:
@@ -46,7 +54,7 @@ def open_mcap(path: Path) -> Bag:
 
 
 def _summarised(path: Path) -> Channels:
-    """Channels as the summary has them; none if there is no summary."""
+    """Channels from the summary; empty if there is no summary."""
     length = path.stat().st_size
     if length < len(MAGIC) + FOOTER_SIZE:
         return {}
@@ -73,17 +81,17 @@ def _channels(records: Iterator[Record]) -> Channels:
                 encoding, _ = _text(content)
                 if encoding in ("cdr", "ros1"):
                     found[number] = name, topic_of(schemas.get(schema, ""), cdr=encoding == "cdr")
-        except Damaged:
+        except DamagedData:
             continue
     return found
 
 
-def _records(path: Path, begin: int, trouble: ReadLog) -> Iterator[Record]:
-    """Records outside and inside of chunks, up to the end of the data or of the summary."""
+def _records(path: Path, begin: int, log: ReadLog) -> Iterator[Record]:
+    """Records outside and inside chunks, up to the end of the data or of the summary."""
     length = path.stat().st_size
     with path.open("rb") as file:
         try:
-            for kind, content in _plain(of_file(file), begin, length):
+            for kind, content in _plain(file_reader(file), begin, length):
                 if kind in (DATA_END, FOOTER):
                     return
                 if kind != CHUNK:
@@ -91,51 +99,51 @@ def _records(path: Path, begin: int, trouble: ReadLog) -> Iterator[Record]:
                     continue
                 try:
                     data = _chunk(content)
-                    yield from _plain(of_part(data), 0, len(data))
-                except Damaged:
-                    trouble.note("damaged chunks")
-            trouble.note("torn ends of the file")
-        except Damaged:
-            trouble.note("torn ends of the file")
+                    yield from _plain(memory_reader(data), 0, len(data))
+                except DamagedData:
+                    log.note("damaged chunks")
+            log.note("truncated ends of the file")
+        except DamagedData:
+            log.note("truncated ends of the file")
 
 
-def _plain(read: Read, begin: int, end: int) -> Iterator[Record]:
-    place = begin
-    while start := read(place, 9):
+def _plain(read: ReadBytes, begin: int, end: int) -> Iterator[Record]:
+    offset = begin
+    while start := read(offset, 9):
         if len(start) < 9:
-            raise Damaged("a torn record")
+            raise DamagedData("a truncated record")
         kind, size = struct.unpack("<BQ", start)
-        place += 9
-        if size > end - place:
+        offset += 9
+        if size > end - offset:
             if kind == CHUNK:
-                # Of a recording that broke off, its last chunk may be read in part.
-                yield kind, read(place, LIMIT)
-            raise Damaged("a torn record")
+                # The last chunk of a truncated recording may be read in part.
+                yield kind, read(offset, MAX_BLOCK)
+            raise DamagedData("a truncated record")
         if kind in (SCHEMA, CHANNEL, MESSAGE, CHUNK):
-            if size > LIMIT:
-                raise Damaged(f"a record of {size} bytes")
-            yield kind, read(place, size)
+            if size > MAX_BLOCK:
+                raise DamagedData(f"a record of {size} bytes")
+            yield kind, read(offset, size)
         else:
             yield kind, b""
-        place += size
+        offset += size
 
 
 def _chunk(content: Bytes) -> Bytes:
-    """Its start and end, unpacked size and checksum are not needed."""
-    packing, content = _text(memoryview(content)[28:])
+    """Decompress a chunk; its times, decompressed size and checksum are not needed."""
+    compression, content = _text(memoryview(content)[28:])
     size, content = _number(content, "Q")
-    return unpacked(content[:size], packing or "none")
+    return decompress(content[:size], compression or "none")
 
 
 def _number(data: Bytes, kind: str) -> tuple[int, Bytes]:
     size = struct.calcsize(f"<{kind}")
     if len(data) < size:
-        raise Damaged("a torn record")
+        raise DamagedData("a truncated record")
     return struct.unpack_from(f"<{kind}", data)[0], data[size:]
 
 
 def _text(data: Bytes) -> tuple[str, Bytes]:
     length, data = _number(data, "I")
     if length > len(data):
-        raise Damaged("a torn text")
-    return bytes(data[:length]).decode("utf-8", "replace"), data[length:]
+        raise DamagedData("a truncated text")
+    return bytes(data[:length]).decode("utf-8", "reoffset"), data[length:]

@@ -1,13 +1,13 @@
 """Bags of ROS 1 and 2 (SQLite, MCAP): events of one topic, images of another.
 
-Messages name their type; those of `recordings.event_messages` and `recordings.image_messages` are
-understood. A bag with several such topics is a question to the user.
+The message types of `event_messages` are read. Where a bag has several topics of such a type, the
+caller has to choose one.
 
-Which clock: all times are put on the clock of the header stamps, which events and images share.
-Events of `dvs_msgs` and packets of `libcaer` are on it already: their driver has added when
-it started to the sensor's clock. Prophesee's sensors (`evt3`, `mono`) count from when they
-were switched on: the first event is set to the stamp of its packet, and all others keep their
-distance from it, since stamps of packets say when these arrived and not when light changed.
+Clock: all times are on the clock of the header stamps, which events and images share. Events of
+`dvs_msgs` and packets of `libcaer` are on it already: their driver adds its start time to the
+sensor's clock. Prophesee's sensors (`evt3`, `mono`) count from power-on: the first event is set to
+the stamp of its packet, and all others keep their distance from it, since stamps of packets give
+the time of arrival and not of the change of light.
 
 Exposures: an image has one stamp, for when its shutter opened. A topic `<images>/exposure` of
 `sensor_msgs/TimeReference`, where there is one, gives the end: its header has the stamp of an
@@ -21,27 +21,27 @@ from itertools import islice
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import Damaged, head
-from sharpfield.recordings.chunks import joined, known_size
+from sharpfield.recordings.bytes import DamagedData, read_head
+from sharpfield.recordings.chunks import merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt import ENCODINGS as EVT_ENCODINGS
-from sharpfield.recordings.prophesee.evt import decoded, trigger_edges
+from sharpfield.recordings.prophesee.evt import decode_chunks, decode_triggers
 from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
 from sharpfield.recordings.ros import libcaer, mcap
 from sharpfield.recordings.ros import ros1 as ros1_bag
 from sharpfield.recordings.ros import sqlite as sqlite_bag
-from sharpfield.recordings.ros.bag import Bag, Fields, Message
+from sharpfield.recordings.ros.bag import Bag, FieldReader, Message
 from sharpfield.recordings.ros.event_messages import (
     ARRAYS,
     COMPRESSED,
     PACKETS,
     PLAIN,
-    Image,
     Packet,
+    StampedImage,
+    decode_image,
     event_arrays,
+    event_header,
     event_packet,
-    image,
-    start,
 )
 from sharpfield.recordings.ros.mcap import open_mcap
 from sharpfield.recordings.ros.ros1 import open_ros1_bag
@@ -52,29 +52,30 @@ OPENERS = {
     mcap.MAGIC: open_mcap,
     sqlite_bag.MAGIC: open_sqlite_bag,
 }
-"""By what a file begins with: bags that broke off have other names."""
+"""Functions to open a bag by its signature; the suffix does not decide, as unfinished bags have
+another."""
 
 EVENT_TYPES, IMAGE_TYPES = (*ARRAYS, *PACKETS), (PLAIN, COMPRESSED)
 EXPOSURE_TYPE = "sensor_msgs/TimeReference"
 
 SENSOR_CLOCKS = (*EVT_ENCODINGS, "mono")
-"""Encodings whose times are those of the sensor."""
+"""Encodings whose times count from power-on of the sensor."""
 
-AHEAD = 64
-"""Messages that are looked at to learn of the size, the encoding and the clock."""
+FIRST_MESSAGES = 64
+"""Messages from which resolution, encoding and clock are found."""
 
 
 @dataclass(frozen=True)
-class Source:
-    """Events of a bag."""
+class EventSource:
+    """Events of one topic of a bag."""
 
     bag: Bag
     topic: str
     size: tuple[int, int]
     encoding: str
-    """Of packets; "" if events are plain."""
+    """Encoding of the packets; "" for event arrays."""
     shift_us: int
-    """From the sensor's clock to that of the stamps."""
+    """Offset from the sensor's clock to that of the stamps."""
 
 
 def open_rosbag(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -86,10 +87,10 @@ def open_rosbag(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
             the images, where there are several such topics; an empty image topic for no images.
 
     Raises:
-        CaptureError: It is no bag, holds neither events nor images, or several topics of either
-            and none was chosen.
+        CaptureError: The file is no bag, holds neither events nor images, or has several topics of
+            either and none was chosen.
     """
-    bag, trouble = _opened(path), ReadLog()
+    bag, log = _opened(path), ReadLog()
     events, image_topic = _chosen(bag, EVENT_TYPES, options.topic, "topic"), options.image_topic
     images = None if image_topic == "" else _chosen(bag, IMAGE_TYPES, image_topic, "image_topic")
     if events is None and images is None:
@@ -102,19 +103,19 @@ def open_rosbag(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         path,
         bag.layout,
         options.size if source is None else source.size,
-        events=None if source is None else partial(_events, source, trouble),
-        frames=None if images is None else partial(_frames, bag, images, trouble),
+        events=None if source is None else partial(_events, source, log),
+        frames=None if images is None else partial(_frames, bag, images, log),
         triggers=partial(_triggers, source) if source is not None and encoded else None,
         bayer="" if images is None else _bayer(bag, images),
-        trouble=trouble,
+        log=log,
         notes={name: kind for name, (kind, _) in bag.topics.items()},
     )
 
 
 def _opened(path: Path) -> Bag:
-    """The bag, be it a file, or a folder of files that follow each other."""
+    """Open a bag: one file, or a folder of consecutive files."""
     if not path.is_dir():
-        start = head(path, 16)
+        start = read_head(path, 16)
         for magic, open_file in OPENERS.items():
             if start.startswith(magic):
                 return open_file(path)
@@ -132,34 +133,34 @@ def _opened(path: Path) -> Bag:
             got=", ".join(sorted(file.name for file in path.iterdir())[:8]) or "an empty folder",
             do="it should hold one or several .db3, or .mcap; unpack files in .zstd first",
         )
-    return _chained(path, [_opened(file) for file in sorted(paths, key=_number)])
+    return _concatenated(path, [_opened(file) for file in sorted(paths, key=_number)])
 
 
 def _number(path: Path) -> tuple[int, str]:
-    """Files of a bag are numbered: 10 comes after 9."""
+    """Sort key of the files of a bag, which are numbered: 10 comes after 9."""
     last = path.stem.rpartition("_")[2]
     return (int(last) if last.isascii() and last.isdigit() else -1, path.stem)
 
 
-def _chained(path: Path, bags: list[Bag]) -> Bag:
-    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
-        return (message for bag in bags for message in bag.messages(wanted, trouble))
+def _concatenated(path: Path, bags: list[Bag]) -> Bag:
+    def messages(wanted: Collection[str], log: ReadLog) -> Iterator[Message]:
+        return (message for bag in bags for message in bag.messages(wanted, log))
 
     topics = {name: topic for bag in bags for name, topic in bag.topics.items()}
     return Bag(path, bags[0].layout, topics, messages)
 
 
-def _chosen(bag: Bag, kinds: tuple[str, ...], asked: str | None, option: str) -> str | None:
-    """The topic that is meant, or None if there is none."""
+def _chosen(bag: Bag, kinds: tuple[str, ...], chosen: str | None, option: str) -> str | None:
+    """Name of the chosen topic; None if the bag has no topic of these types."""
     found = [name for name, topic in bag.topics.items() if topic.kind in kinds]
-    if asked is not None and asked not in found:
+    if chosen is not None and chosen not in found:
         raise CaptureError(
-            f"the bag has no topic {asked} of a known type",
+            f"the bag has no topic {chosen} of a known type",
             where=bag.path,
             got=_listed(bag, bag.topics),
             do=f"known types are {', '.join(kinds)}",
         )
-    if asked is None and len(found) > 1:
+    if chosen is None and len(found) > 1:
         raise CaptureError(
             "the bag has several topics of events"
             if kinds is EVENT_TYPES
@@ -168,25 +169,25 @@ def _chosen(bag: Bag, kinds: tuple[str, ...], asked: str | None, option: str) ->
             got=_listed(bag, found),
             do=f"choose one: {option}={found[0]}",
         )
-    return asked or (found[0] if found else None)
+    return chosen or (found[0] if found else None)
 
 
 def _listed(bag: Bag, names: Collection[str]) -> str:
     return ", ".join(f"{name} ({bag.topics[name].kind})" for name in names) or "no topics"
 
 
-def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> Source:
-    """What the first messages tell.
+def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> EventSource:
+    """Resolution, encoding and clock of a topic, from its first messages.
 
     Raises:
-        CaptureError: They are encoded in an unknown way, or do not tell the size.
+        CaptureError: The encoding or the resolution is unknown.
     """
     known, stated, encoding = bag.topics[topic], None, ""
-    for message in islice(bag.messages([topic], ReadLog()), AHEAD):
+    for message in islice(bag.messages([topic], ReadLog()), FIRST_MESSAGES):
         try:
-            width, height = start(Fields(message, known)).size
+            width, height = event_header(FieldReader(message, known)).size
             encoding = event_packet(message, known).encoding if known.kind in PACKETS else ""
-        except Damaged:
+        except DamagedData:
             continue
         stated = (width, height) if width and height else None
         break
@@ -197,103 +198,103 @@ def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> Source:
             got=encoding,
             do=f"known are {', '.join((*EVT_ENCODINGS, *libcaer.ENCODINGS))}",
         )
-    source = Source(bag, topic, known_size(stated, given, bag.path), encoding, shift_us=0)
+    source = EventSource(bag, topic, resolve_size(stated, given, bag.path), encoding, shift_us=0)
     return replace(source, shift_us=_shift_us(source))
 
 
-def _shift_us(source: Source) -> int:
-    """How far the stamp of the first packet with events is from the first of these."""
+def _shift_us(source: EventSource) -> int:
+    """Stamp of the first packet with events, minus the time of its first event."""
     if source.encoding not in SENSOR_CLOCKS:
         return 0
     packets: list[Packet] = []
-    for packet in islice(_packets(source, ReadLog()), AHEAD):
+    for packet in islice(_packets(source, ReadLog()), FIRST_MESSAGES):
         packets.append(packet)
-        # The times of a packet may need what came before it.
+        # Decoding the times of a packet may need the packets before it.
         first = next(_decoded(source, iter(packets), ReadLog()), None)
         if first is not None and len(first):
             return (packet.stamp_ns + 500) // 1000 - int(first.t_us[0])
     return 0
 
 
-def _events(source: Source, trouble: ReadLog) -> Chunks:
-    trouble = trouble.anew("events")
+def _events(source: EventSource, log: ReadLog) -> Chunks:
+    log = log.start("events")
     if not source.encoding:
-        messages = source.bag.messages([source.topic], trouble)
-        pieces = event_arrays(messages, source.bag.topics[source.topic], trouble)
-        return joined(pieces, source.size, where=source.bag.path, trouble=trouble)
-    chunks = _decoded(source, _packets(source, trouble), trouble)
+        messages = source.bag.messages([source.topic], log)
+        raw_chunks = event_arrays(messages, source.bag.topics[source.topic], log)
+        return merge_chunks(raw_chunks, source.size, where=source.bag.path, log=log)
+    chunks = _decoded(source, _packets(source, log), log)
     return (replace(chunk, t_us=chunk.t_us + source.shift_us) for chunk in chunks)
 
 
-def _decoded(source: Source, packets: Iterator[Packet], trouble: ReadLog) -> Chunks:
-    """Events by the clock of the payload."""
+def _decoded(source: EventSource, packets: Iterator[Packet], log: ReadLog) -> Chunks:
+    """Decode packets; times are on the clock of the payload."""
     where, encoding = source.bag.path, source.encoding
     if encoding in EVT_ENCODINGS:
         payloads = (bytes(packet.payload) for packet in packets)
-        return decoded(encoding, payloads, source.size, where=where, trouble=trouble)
-    pieces = (libcaer.decode(encoding, packet.payload, packet.base_ns) for packet in packets)
-    return joined(pieces, source.size, where=where, trouble=trouble)
+        return decode_chunks(encoding, payloads, source.size, where=where, log=log)
+    raw_chunks = (libcaer.decode(encoding, packet.payload, packet.base_ns) for packet in packets)
+    return merge_chunks(raw_chunks, source.size, where=where, log=log)
 
 
-def _triggers(source: Source) -> Triggers:
+def _triggers(source: EventSource) -> Triggers:
     payloads = (bytes(packet.payload) for packet in _packets(source, ReadLog()))
-    found = trigger_edges(source.encoding, payloads, where=source.bag.path)
+    found = decode_triggers(source.encoding, payloads, where=source.bag.path)
     return replace(found, t_us=found.t_us + source.shift_us)
 
 
-def _packets(source: Source, trouble: ReadLog) -> Iterator[Packet]:
+def _packets(source: EventSource, log: ReadLog) -> Iterator[Packet]:
     topic = source.bag.topics[source.topic]
-    for message in source.bag.messages([source.topic], trouble):
+    for message in source.bag.messages([source.topic], log):
         try:
             packet = event_packet(message, topic)
-        except Damaged:
-            trouble.note("damaged messages")
+        except DamagedData:
+            log.note("damaged messages")
             continue
         if packet.encoding == source.encoding:
             yield packet
         else:
-            trouble.note("messages encoded otherwise than the first")
+            log.note("messages encoded otherwise than the first")
 
 
 def _bayer(bag: Bag, topic: str) -> str:
-    """The tile of the first image."""
+    """Colour filter array of the first image."""
     return next((found.bayer for found in _images(bag, topic, ReadLog())), "")
 
 
-def _frames(bag: Bag, topic: str, trouble: ReadLog) -> Iterator[Frame]:
-    trouble = trouble.anew("frames")
-    ends = _exposure_ends(bag, f"{topic}/exposure", trouble)
+def _frames(bag: Bag, topic: str, log: ReadLog) -> Iterator[Frame]:
+    log = log.start("frames")
+    ends = _exposure_ends(bag, f"{topic}/exposure", log)
     before = None
-    for found in _images(bag, topic, trouble):
+    for found in _images(bag, topic, log):
         opened = (found.stamp_ns + 500) // 1000
         if before is not None and opened < before:
-            trouble.note("frames earlier than those before them")
+            log.note("frames earlier than those before them")
             continue
         before = opened
         yield Frame(found.image, opened, max(opened, ends.get(opened, opened)))
 
 
-def _images(bag: Bag, topic: str, trouble: ReadLog) -> Iterator[Image]:
-    for message in bag.messages([topic], trouble):
+def _images(bag: Bag, topic: str, log: ReadLog) -> Iterator[StampedImage]:
+    for message in bag.messages([topic], log):
         try:
-            found = image(message, bag.topics[topic])
-        except Damaged:
-            trouble.note("damaged frames")
+            found = decode_image(message, bag.topics[topic])
+        except DamagedData:
+            log.note("damaged frames")
             continue
         yield found
 
 
-def _exposure_ends(bag: Bag, topic: str, trouble: ReadLog) -> dict[int, int]:
-    """When the exposure ended that began at a time; empty if the bag does not say."""
+def _exposure_ends(bag: Bag, topic: str, log: ReadLog) -> dict[int, int]:
+    """End of each exposure by its start, in us; empty if the bag has no such topic."""
     ends: dict[int, int] = {}
     if topic not in bag.topics or bag.topics[topic].kind != EXPOSURE_TYPE:
         return ends
-    for message in bag.messages([topic], trouble):
+    for message in bag.messages([topic], log):
         try:
-            fields = Fields(message, bag.topics[topic])
+            fields = FieldReader(message, bag.topics[topic])
             opened_ns, closed_ns = fields.header_ns(), fields.stamp_ns()
-        except Damaged:
-            trouble.note("damaged messages")
+        except DamagedData:
+            log.note("damaged messages")
             continue
         ends[(opened_ns + 500) // 1000] = (closed_ns + 500) // 1000
     return ends

@@ -1,4 +1,4 @@
-"""Bags of ROS 2 in SQLite, as its first releases wrote them: tables of topics and of messages.
+"""Bags of ROS 2 in SQLite, the default of its first releases: tables of topics and messages.
 
 Source: the schema of rosbag2's storage plug-in `sqlite3`.
 """
@@ -9,25 +9,25 @@ from contextlib import closing
 from pathlib import Path
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import Bytes, Damaged, head, unpacked
+from sharpfield.recordings.bytes import Bytes, DamagedData, decompress, read_head
 from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import Bag, Message, topic_of
 
 MAGIC = b"SQLite format 3\0"
 FAILURES = (sqlite3.Error, UnicodeDecodeError)
-"""Of a damaged database; the second, when not even the message of the first can be read."""
+"""Errors of a damaged database; the second where not even the error text can be decoded."""
 
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""What a compressed message begins with; others begin with 0."""
+"""Signature of a compressed message; others begin with 0."""
 
 
 def open_sqlite_bag(path: Path) -> Bag:
     """Open a `.db3` file.
 
     Raises:
-        CaptureError: It is none, or cannot be read at all.
+        CaptureError: The file is no bag of ROS 2.
     """
-    if head(path, len(MAGIC)) != MAGIC:
+    if read_head(path, len(MAGIC)) != MAGIC:
         raise CaptureError("the file is no SQLite database", where=path)
     try:
         with closing(_connected(path)) as database:
@@ -37,10 +37,10 @@ def open_sqlite_bag(path: Path) -> Bag:
     topics = {str(name): topic_of(str(kind), cdr=True) for _, name, kind in rows}
     numbers = {number: str(name) for number, name, _ in rows}
 
-    def messages(wanted: Collection[str], trouble: ReadLog) -> Iterator[Message]:
+    def messages(wanted: Collection[str], log: ReadLog) -> Iterator[Message]:
         chosen = [number for number, name in numbers.items() if name in wanted]
         marks = ", ".join("?" * len(chosen))
-        # In the order of recording: by time would need an index, which is damaged more easily.
+        # In recorded order: ordering by time would need an index, which is damaged more easily.
         query = (
             "SELECT topic_id, timestamp, data FROM messages"
             f" WHERE topic_id IN ({marks}) ORDER BY id"
@@ -50,16 +50,16 @@ def open_sqlite_bag(path: Path) -> Bag:
                 for number, logged_ns, data in database.execute(query, chosen):
                     try:
                         yield Message(numbers[number], int(logged_ns), _plain(data))
-                    except (Damaged, ValueError, TypeError, OverflowError):
-                        trouble.note("damaged messages")
+                    except (DamagedData, ValueError, TypeError, OverflowError):
+                        log.note("damaged messages")
         except FAILURES:
-            trouble.note("torn ends of the file")
+            log.note("truncated ends of the file")
 
     return Bag(path, "ROS2 SQLite bag", topics, messages)
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    # Immutable: no journal is looked for, and nothing is written beside the file.
+    # Immutable: SQLite looks for no journal and writes nothing beside the file.
     database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
     database.text_factory = lambda data: data.decode("utf-8", "replace")
     return database
@@ -67,5 +67,5 @@ def _connected(path: Path) -> sqlite3.Connection:
 
 def _plain(data: object) -> Bytes:
     if not isinstance(data, bytes):
-        raise Damaged("a message that is no bytes")
-    return unpacked(data, "zstd") if data.startswith(ZSTD) else data
+        raise DamagedData("a message that is no bytes")
+    return decompress(data, "zstd") if data.startswith(ZSTD) else data

@@ -1,8 +1,8 @@
-"""Events that a file keeps as columns, turned into a recording: what HDF5, npz and npy share.
+"""Recordings of files that store events as columns: shared by HDF5, npz and npy.
 
-A file is described as a `storage.EventFile`; here it is read a chunk at a time. Events outside the
-sensor are left out and counted, and so is whatever follows a part that cannot be read. Units of
-time and sizes of sensors that the file does not tell are asked for: they are never guessed.
+The file is a `storage.EventFile`, read a chunk at a time. Events outside the sensor are left out
+and counted, as is everything after a part that cannot be read. A time unit or sensor resolution
+that the file does not give must come from the caller; it is never guessed.
 """
 
 from collections.abc import Callable
@@ -19,27 +19,26 @@ from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.storage.event_columns import UNITS
 from sharpfield.storage.event_file import CHUNK, EventFile
 
-Open = Callable[[], EventFile]
-"""Opens the file anew."""
+OpenFile = Callable[[], EventFile]
+"""Opens the file again."""
 
 
-def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
-    """A recording of the events of a file.
+def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
+    """Make a recording of the events of a file.
 
     Raises:
-        CaptureError: The file cannot be opened, or the unit of its times or the size of its
-            sensor is not known.
+        CaptureError: The file cannot be opened, or its time unit or resolution is unknown.
     """
-    trouble = ReadLog()
+    log = ReadLog()
     with open_file() as file:
         _expect_unit(file)
         _expect_size(file)
-        whole = _whole_numbers(file)
+        integral = _integral(file)
         size, bayer, stated = file.size, file.bayer, file.thresholds
 
     def events() -> Chunks:
         with open_file() as opened:
-            yield from _chunks(opened, trouble.anew("events"), whole=whole)
+            yield from _chunks(opened, log.start("events"), integral=integral)
 
     return Recording(
         path,
@@ -48,11 +47,11 @@ def recording_of(layout: str, path: Path, open_file: Open) -> Recording:
         events=events,
         bayer=bayer,
         thresholds=None if stated is None else Thresholds(*stated),
-        trouble=trouble,
+        log=log,
     )
 
 
-def _chunks(file: EventFile, trouble: ReadLog, *, whole: bool) -> Chunks:
+def _chunks(file: EventFile, log: ReadLog, *, integral: bool) -> Chunks:
     before: int | None = None
     outside = 0
     for first in range(0, len(file), CHUNK):
@@ -62,19 +61,19 @@ def _chunks(file: EventFile, trouble: ReadLog, *, whole: bool) -> Chunks:
         except CaptureError:
             if not first:
                 raise
-            trouble.note("events from a damaged part onwards", len(file) - first)
+            log.note("events from a damaged part onwards", len(file) - first)
             return
-        kept = _inside(stored, file.size, whole=whole)
-        outside += (left_out := int((~kept).sum()))
-        trouble.note("events outside the sensor", left_out)
+        keep = _inside(stored, file.size, integral=integral)
+        outside += (left_out := int((~keep).sum()))
+        log.note("events outside the sensor", left_out)
         if left_out:
             assert file.size is not None, "the size was expected when the file was opened"
             column, row = (float(np.nan_to_num(stored[name]).max()) for name in ("x", "y"))
             expect_inside(outside, last, (column, row), file.size, file.path)
-        columns = {name: column[kept] for name, column in stored.items()}
-        if whole:
+        columns = {name: column[keep] for name, column in stored.items()}
+        if integral:
             columns |= {name: columns[name].astype(np.uint16) for name in ("x", "y")}
-        numbers = first + np.flatnonzero(kept)
+        numbers = first + np.flatnonzero(keep)
         part = replace(file, columns=columns, ms_to_idx=None).part(0, len(numbers))
         _expect_order(part.t_us, numbers, before, file.path)
         if len(part):
@@ -83,20 +82,20 @@ def _chunks(file: EventFile, trouble: ReadLog, *, whole: bool) -> Chunks:
 
 
 def _inside(
-    stored: dict[str, Shaped[np.ndarray, "n"]], size: tuple[int, int] | None, *, whole: bool
+    stored: dict[str, Shaped[np.ndarray, "n"]], size: tuple[int, int] | None, *, integral: bool
 ) -> Bool[np.ndarray, "n"]:
-    """Which events lie on the sensor; rectified ones may lie a sensor's width beside it."""
+    """Mask of events on the sensor; rectified ones may lie up to one sensor size beside it."""
     assert size is not None, "the size was expected when the file was opened"
-    kept = np.ones(len(stored["t"]), bool)
+    keep = np.ones(len(stored["t"]), bool)
     for name, pixels in zip(("x", "y"), size, strict=True):
         column = stored[name]
-        if whole or column.dtype.kind != "f":
-            kept &= (column >= 0) & (column < pixels)
-            if whole and column.dtype.kind == "f":
-                kept &= np.floor(column) == column
+        if integral or column.dtype.kind != "f":
+            keep &= (column >= 0) & (column < pixels)
+            if integral and column.dtype.kind == "f":
+                keep &= np.floor(column) == column
         else:
-            kept &= (column >= -pixels) & (column <= 2 * pixels - 1)
-    return kept
+            keep &= (column >= -pixels) & (column <= 2 * pixels - 1)
+    return keep
 
 
 def _expect_order(
@@ -120,9 +119,9 @@ def _expect_order(
     )
 
 
-def _whole_numbers(file: EventFile) -> bool:
-    """Whether coordinates are whole numbers: rectified ones never are in a whole chunk."""
-    with np.errstate(invalid="ignore"):  # floats that are not even proper NaN
+def _integral(file: EventFile) -> bool:
+    """Whether the first chunk has integer coordinates; rectified events do not."""
+    with np.errstate(invalid="ignore"):  # also for signalling NaN
         return all(
             bool(((np.floor(column) == column) | ~np.isfinite(column)).all())
             for column in (file.stored(name, 0, min(len(file), CHUNK)) for name in ("x", "y"))

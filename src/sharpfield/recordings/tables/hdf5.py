@@ -1,19 +1,18 @@
-"""HDF5 files of events, as data sets and programs lay them out.
+"""HDF5 files of events, in the dialects of data sets and programs.
 
-    DSEC, TUM-VIE, ours      events/{x, y, t, p}, and what `storage.event_layouts` tells; us
-    EDS, Ev-DeblurNeRF       {x, y, t, p} at the root; the unit is not told
+    DSEC, TUM-VIE, ours      events/{x, y, t, p}, see `storage.event_layouts`; us
+    EDS, Ev-DeblurNeRF       {x, y, t, p} at the root; unit unknown
     M3ED                     prophesee/{left, right}/{x, y, t, p}; us; ovc/{left, right, rgb}/data,
-                             taken by cameras beside those of events, and ovc/ts in us
+                             from cameras beside the event cameras, and ovc/ts in us
     E2VID, event_utils       events/{xs, ys, ts, ps}; s; images/image%09d with a time each
     MVSEC                    davis/{left, right}/events, rows x, y, t, p; s; image_raw, image_raw_ts
     v2e                      events, rows t, x, y, p; us
     Prophesee                CD/events, records x, y, p, t; us
 
-Where a file holds several cameras, the caller names one; frames are those of the same side unless
-another camera is named for them. Frames of these files have one time each; how long the shutter was
-open they do not tell.
+Where a file holds several cameras, the caller chooses one; frames are those of the same side unless
+another camera is chosen for them. Frames of these files have one time each and no exposure.
 
-Prophesee's files are packed in a way of their own (ECF): HDF5 needs their plug-in to read them.
+Prophesee's files use a compression of their own (ECF): HDF5 needs their plug-in to read them.
 
 Source: Gehrig et al., *DSEC* (RA-L 2021); Klenk et al., *TUM-VIE* (IROS 2021); Chaney et al.,
 *M3ED* (CVPRW 2023); Stoffregen et al., *Reducing the Sim-to-Real Gap for Event Cameras* (ECCV
@@ -33,7 +32,7 @@ import numpy as np
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Frame, Recording
-from sharpfield.recordings.tables.columns import recording_of
+from sharpfield.recordings.tables.columns import column_recording
 from sharpfield.storage.event_columns import known_unit, whole_us
 from sharpfield.storage.event_file import UNREADABLE, EventFile
 from sharpfield.storage.event_layouts import (
@@ -45,29 +44,29 @@ from sharpfield.storage.event_layouts import (
 )
 
 CAMERA = "*"
-"""Stands in a path for the name of one of several cameras."""
+"""Placeholder for the camera name in a path."""
 
 DAMAGED = (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError)
-"""What h5py may end in where the structure of a file is damaged: a type that does not exist ..."""
+"""Errors of h5py where the structure of a file is damaged: a type that does not exist ..."""
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """Where a kind of file keeps what it holds."""
+    """Where a kind of file stores events and frames."""
 
     layout: str
     events: str
     """Path of the group of columns, or of the table."""
     columns: tuple[str, ...]
-    """Names of x, y, t, p in the group, or of a record; or what the columns of the table are."""
+    """Names of x, y, t, p in the group or record; or the order of the columns of a table."""
     unit: str
     size: Callable[[h5py.File, str], tuple[int, int] | None] = lambda file, camera: None
-    """How the file tells the size of its sensor."""
+    """Reads the sensor resolution from the file."""
     frames: Callable[[h5py.File, str], Iterator[Frame]] | None = None
     images: str = ""
-    """Path of the frames, if the file has any."""
+    """Path of the frames; "" if there are none."""
     records: bool = False
-    """Whether events are records with these columns."""
+    """Whether events are records with these fields."""
 
     @property
     def table(self) -> bool:
@@ -75,7 +74,7 @@ class Dialect:
         return self.columns[0] in ("xytp", "txyp")
 
     def cameras(self, file: h5py.File) -> list[str]:
-        """The cameras whose events the file keeps in this way; [""] if there is no choice."""
+        """Cameras whose events the file stores in this dialect; [""] if it holds one camera."""
         before, star, after = self.events.partition(f"{CAMERA}/")
         if not star:
             return [""] if self._holds(file.get(self.events)) else []
@@ -84,7 +83,7 @@ class Dialect:
             return []
         return [str(name) for name in group if self._holds(file.get(f"{before}{name}/{after}"))]
 
-    def at(self, camera: str) -> str:
+    def path(self, camera: str) -> str:
         """Path of the events of a camera."""
         return self.events.replace(CAMERA, camera).rstrip("/")
 
@@ -98,7 +97,7 @@ class Dialect:
 
 
 class TableColumn:
-    """One column of a table, or one field of records, read piece by piece."""
+    """One column of a table, or one field of records, read part by part."""
 
     def __init__(self, table: h5py.Dataset, column: int | str) -> None:
         self._table, self._column = table, column
@@ -124,43 +123,43 @@ def open_hdf5(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
             side, or "" for none.
 
     Raises:
-        CaptureError: It holds no events in a known layout, or does not say its unit or size.
+        CaptureError: The file has no events in a known layout, or its unit or size is unknown.
     """
     unit, size = options.unit, options.size
-    with _whole(path):
+    with _damage_reported(path):
         with opened_hdf5(path) as file:
             found = [(d, camera) for d in DIALECTS for camera in d.cameras(file)]
         if not found:
-            return recording_of("HDF5", path, lambda: open_events(path, unit=unit, size=size))
+            return column_recording("HDF5", path, lambda: open_events(path, unit=unit, size=size))
         dialect, camera = _chosen(found, options.topic, path)
-        made = recording_of(
+        made = column_recording(
             dialect.layout, path, lambda: _event_file(path, dialect, camera, unit, size)
         )
         return replace(made, frames=_frames(path, dialect, camera, options.image_topic))
 
 
 def _frames(
-    path: Path, dialect: Dialect, camera: str, asked: str | None
+    path: Path, dialect: Dialect, camera: str, chosen: str | None
 ) -> Callable[[], Iterator[Frame]] | None:
-    """What reads the frames; None if there are none."""
-    read, name = dialect.frames, camera if asked is None else asked
-    if read is None or asked == "":
+    """Function that reads the frames; None if there are none."""
+    read, name = dialect.frames, camera if chosen is None else chosen
+    if read is None or chosen == "":
         return None
     with opened_hdf5(path) as file:
         before, star, after = dialect.images.partition(CAMERA)
         group: Any = file.get(before.rstrip("/") or "/") if star else None
-        able = [one for one in group or () if f"{before}{one}{after}" in file]
-        there = name in able if star else dialect.images in file and not asked
-    if asked and not there:
+        available = [one for one in group or () if f"{before}{one}{after}" in file]
+        there = name in available if star else dialect.images in file and not chosen
+    if chosen and not there:
         raise CaptureError(
             "the file has no frames of that camera",
             where=path,
-            got=asked,
-            do=f"choose an image topic: {', '.join(able) or 'there is no choice here'}",
+            got=chosen,
+            do=f"choose an image topic: {', '.join(available) or 'there is no choice here'}",
         )
 
     def frames() -> Iterator[Frame]:
-        with _whole(path), opened_hdf5(path) as file:
+        with _damage_reported(path), opened_hdf5(path) as file:
             yield from read(file, name)
 
     return frames if there else None
@@ -185,18 +184,19 @@ def _event_file(
 ) -> EventFile:
     with ExitStack() as resources:
         file = resources.enter_context(opened_hdf5(path))
-        held: Any = file[dialect.at(camera)]
+        stored: Any = file[dialect.path(camera)]
         columns: dict[str, Any]
         if dialect.table or dialect.records:
-            expect_filters(held, f"{path}, {held.name}")
-            expect_filled(held, f"{path}, {held.name}")
-            places = dialect.columns if dialect.records else map(dialect.columns[0].index, "xytp")
+            expect_filters(stored, f"{path}, {stored.name}")
+            expect_filled(stored, f"{path}, {stored.name}")
+            order = dialect.columns if dialect.records else map(dialect.columns[0].index, "xytp")
             columns = {
-                name: TableColumn(held, place) for name, place in zip("xytp", places, strict=True)
+                name: TableColumn(stored, column)
+                for name, column in zip("xytp", order, strict=True)
             }
         else:
             columns = {
-                name: _column(held, dialect.columns[i], path) for i, name in enumerate("xytp")
+                name: _column(stored, dialect.columns[i], path) for i, name in enumerate("xytp")
             }
         if len({len(column) for column in columns.values()}) != 1:
             raise CaptureError(
@@ -228,11 +228,11 @@ def _column(group: h5py.Group, name: str, path: Path) -> h5py.Dataset:
 
 
 @contextmanager
-def _whole(path: Path) -> Iterator[None]:
-    """Whatever the HDF5 library stumbles over within is damage of the file.
+def _damage_reported(path: Path) -> Iterator[None]:
+    """Report errors of the HDF5 library as damage of the file.
 
     Raises:
-        CaptureError: It stumbled.
+        CaptureError: There was one.
     """
     try:
         yield
@@ -251,7 +251,7 @@ def _m3ed_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
 
 
 def _attribute_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
-    """`sensor_resolution` is height and width."""
+    """From the attribute `sensor_resolution`, height and width."""
     stored = np.asarray(file.attrs.get("sensor_resolution", ())).ravel()
     if len(stored) != 2 or stored.dtype.kind not in "iuf":
         return None
@@ -259,7 +259,7 @@ def _attribute_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
 
 
 def _geometry_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
-    """`geometry` is a text, "1280x720"."""
+    """From the attribute `geometry`, a text "1280x720"."""
     stored = file.attrs.get("geometry", "")
     text = stored.decode("latin-1") if isinstance(stored, bytes) else str(stored)
     match = re.fullmatch("([0-9]{1,5})x([0-9]{1,5})", text)
@@ -267,7 +267,7 @@ def _geometry_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
 
 
 def _mvsec_size(file: h5py.File, camera: str) -> tuple[int, int] | None:
-    """The frames come from the pixels of the same sensor."""
+    """Resolution of the frames, which come from the pixels of the same sensor."""
     stored = file.get(f"davis/{camera}/image_raw")
     if not isinstance(stored, h5py.Dataset) or stored.ndim != 3:
         return None
@@ -296,7 +296,7 @@ def _m3ed_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
 
 
 def _filled(file: h5py.File, name: str) -> Any:
-    """A data set that is as long as it says."""
+    """A data set that is as long as its header says."""
     found = file[name]
     if not isinstance(found, h5py.Dataset):
         raise TypeError(f"{name} is no data set")
@@ -351,7 +351,7 @@ DIALECTS = (
         records=True,
     ),
 )
-"""Ways to lay events out that `storage.open_events` does not know."""
+"""Dialects that `storage.event_layouts.open_events` does not read."""
 
 
 FORMAT = Format(

@@ -1,22 +1,22 @@
-"""Events in numpy's own files, as the papers that train on events share them.
+"""Events in numpy files, as published with papers that train on events; and N-MNIST's binary files.
 
-    npz, x y t p            EventNeRF, vid2e and many more; the unit is not told, unless it is ours
-    npz, position timestamp polarity    robust and deblur e-NeRF; ns
-    folder of npz, x y t p  vid2e: one for each gap between frames, `0000000000.npz` ...; ns
-    npy, records            of named fields x, y, t, p; the unit is not told
-    npy, a table            rows x y t p (BeNeRF) or t x y p (v2e, ECD); the unit is not told
+    npz, x y t p            EventNeRF, vid2e and many more; unit unknown, except in our own files
+    npz, position timestamp polarity    Robust e-NeRF and Deblur e-NeRF; ns
+    folder of npz, x y t p  vid2e: one for each interval between frames, `0000000000.npz` ...; ns
+    npy, records            with fields x, y, t, p; unit unknown
+    npy, a table            rows x y t p (BeNeRF) or t x y p (v2e, ECD); unit unknown
 
-Which column of a table is which follows from what the others cannot be: times ascend, and
-polarities take two values. Where that leaves a choice, the caller is asked.
+The order of the columns of a table follows from the values: times ascend, and polarities take two
+values. Where both orders are possible, the caller must give it.
 
 Source: Gehrig et al., *Video to Events* (CVPR 2020); Rudnev et al., *EventNeRF* (CVPR 2023); Low
 and Lee, *Robust e-NeRF* (ICCV 2023); Li et al., *BeNeRF* (ECCV 2024).
 
-The data sets N-MNIST and N-Caltech101: five bytes per event, one small file per image.
+The data sets N-MNIST and N-Caltech101 have five bytes per event, and one small file per image:
 
     x, 1 byte; y, 1 byte; polarity, 1 bit; time in us, 23 bits, most significant byte first
 
-The file says no size. A row of 240 is no row: such a record says that 2^13 us have gone by.
+The file does not give the resolution. Row 240 marks a record that is no event: 2^13 us have passed.
 
 Source: Orchard et al., *Converting static image datasets to spiking neuromorphic datasets using
 saccades* (Frontiers in Neuroscience 2015), and the reader its authors publish.
@@ -34,11 +34,11 @@ import numpy as np
 from jaxtyping import Shaped
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.bytes import blocks, head, zip_holds
-from sharpfield.recordings.chunks import RawChunk, joined, known_size
+from sharpfield.recordings.bytes import read_blocks, read_head, zip_holds
+from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording
-from sharpfield.recordings.tables.columns import recording_of
+from sharpfield.recordings.tables.columns import column_recording
 from sharpfield.storage.event_columns import ZippedColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
 from sharpfield.storage.event_layouts import UNREADABLE_NPZ, open_events
@@ -46,17 +46,17 @@ from sharpfield.storage.images import list_images
 
 POSITION = {"position.npy", "timestamp.npy", "polarity.npy"}
 ORDERS = ("xytp", "txyp")
-"""What the columns of a table may be."""
+"""Possible orders of the columns of a table."""
 
 NUMBERED = re.compile(r"\d{10}\.npz")
-"""Files of vid2e; no other program is known to name them so."""
+"""File names of vid2e; no other program is known to use them."""
 
 Array = Shaped[np.ndarray, "..."]
 
 
 @dataclass(frozen=True)
-class Slice:
-    """One column of an array that has several, read piece by piece."""
+class ArrayColumn:
+    """One column of a table or one field of records, read part by part."""
 
     rows: Array | ZippedColumn
     column: int | str
@@ -81,7 +81,7 @@ def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         options: `unit` and `size`, where the file does not give them.
 
     Raises:
-        CaptureError: It holds no events in a known layout, or does not say its unit or size.
+        CaptureError: The file has no events in a known layout, or its unit or size is unknown.
     """
     unit, size = options.unit, options.size
     try:
@@ -90,19 +90,19 @@ def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     except UNREADABLE_NPZ as error:
         raise _unreadable(path, error) from None
     if not names >= POSITION:
-        return recording_of("npz", path, lambda: open_events(path, unit=unit, size=size))
-    return recording_of("Robust e-NeRF npz", path, lambda: _positions(path, unit or "ns", size))
+        return column_recording("npz", path, lambda: open_events(path, unit=unit, size=size))
+    return column_recording("Robust e-NeRF npz", path, lambda: _positions(path, unit or "ns", size))
 
 
 def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
-    """Open a folder of npz files, each of which goes on where the one before it ends.
+    """Open a folder of npz files, each of which continues the one before it.
 
     Args:
         path: The folder.
         options: `unit` (ns by default for files of vid2e, known by their names) and `size`.
 
     Raises:
-        CaptureError: There are none, or the unit or the size is not known.
+        CaptureError: There are none, or their unit or resolution is unknown.
     """
     files = sorted(path.glob("*.npz"))
     if not files:
@@ -111,11 +111,11 @@ def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recordin
         options = replace(options, unit="ns")
     opened = [open_npz(file, options) for file in files]
 
-    trouble = ReadLog()
+    log = ReadLog()
 
     def events() -> Chunks:
         before: int | None = None
-        noted = trouble.anew("events")
+        pass_log = log.start("events")
         for file in opened:
             for chunk in file.chunks():
                 if before is not None and chunk.t_us[0] < before:
@@ -127,11 +127,11 @@ def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recordin
                     )
                 before = int(chunk.t_us[-1])
                 yield chunk
-            for kind, count in file.trouble.counts.items():
-                noted.note(kind, count)
+            for kind, count in file.log.counts.items():
+                pass_log.note(kind, count)
 
     layout = "folder of npz"
-    return replace(opened[0], path=path, layout=layout, events=events, trouble=trouble)
+    return replace(opened[0], path=path, layout=layout, events=events, log=log)
 
 
 def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -142,18 +142,18 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         options: `unit` and `size`; `columns`, the order of the columns of a table.
 
     Raises:
-        CaptureError: It holds no events, or the unit, the size or the columns are not known.
+        CaptureError: The file holds no events, or its unit, resolution or columns are unknown.
     """
     array = _mapped(path)
     unit = known_unit(options.unit) if options.unit else None
     if array.dtype.names is not None:
         fields = _fields(array, path)
-        return recording_of(
+        return column_recording(
             "npy of records",
             path,
             lambda: EventFile(
                 path,
-                {name: Slice(array, field) for name, field in fields.items()},
+                {name: ArrayColumn(array, field) for name, field in fields.items()},
                 unit=unit,
                 size=options.size,
             ),
@@ -169,12 +169,12 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         raise CaptureError(
             "unknown order of columns", where=path, got=order, do='write it like "xytp" or "txyp"'
         )
-    return recording_of(
+    return column_recording(
         f"npy table {order}",
         path,
         lambda: EventFile(
             path,
-            {name: Slice(array, order.index(name)) for name in "xytp"},
+            {name: ArrayColumn(array, order.index(name)) for name in "xytp"},
             unit=unit,
             size=options.size,
         ),
@@ -187,8 +187,8 @@ def _positions(path: Path, unit: str, size: tuple[int, int] | None) -> EventFile
             archive = resources.enter_context(zipfile.ZipFile(path))
             position, again = (ZippedColumn(archive, "position.npy", 2) for _ in range(2))
             columns = {
-                "x": Slice(position, 0),
-                "y": Slice(again, 1),
+                "x": ArrayColumn(position, 0),
+                "y": ArrayColumn(again, 1),
                 "t": ZippedColumn(archive, "timestamp.npy"),
                 "p": ZippedColumn(archive, "polarity.npy"),
             }
@@ -225,7 +225,7 @@ def _mapped(path: Path) -> Array:
 
 
 def _fields(array: Array, path: Path) -> dict[str, str]:
-    """The names of the fields x, y, t, p in records."""
+    """Field names of x, y, t and p in records."""
     known = {"t": ("t", "ts", "timestamp", "time"), "p": ("p", "polarity", "pol", "on")}
     found = {
         name: field
@@ -243,8 +243,8 @@ def _fields(array: Array, path: Path) -> dict[str, str]:
 
 
 def _order(array: Array, path: Path) -> str:
-    """The only order of columns that the values allow."""
-    possible = [order for order in ORDERS if _may_be(array, order)]
+    """The only order of the columns that the values allow."""
+    possible = [order for order in ORDERS if _is_possible(array, order)]
     if len(possible) == 1:
         return possible[0]
     raise CaptureError(
@@ -257,9 +257,9 @@ def _order(array: Array, path: Path) -> str:
     )
 
 
-def _may_be(array: Array, order: str) -> bool:
+def _is_possible(array: Array, order: str) -> bool:
     before = -np.inf
-    for rows in _pieces(array):
+    for rows in _row_chunks(array):
         x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
         if not (np.isin(p, (-1, 0, 1)).all() and np.isfinite(np.stack([x, y])).all()):
             return False
@@ -269,7 +269,7 @@ def _may_be(array: Array, order: str) -> bool:
     return True
 
 
-def _pieces(array: Array) -> Iterator[Array]:
+def _row_chunks(array: Array) -> Iterator[Array]:
     for first in range(0, len(array), CHUNK):
         yield np.asarray(array[first : first + CHUNK], np.float64)
 
@@ -284,33 +284,33 @@ RECORD = 5
 """Bytes of an event."""
 
 SIZES = {"nmnist": (34, 34), "ncaltech101": (240, 180)}
-"""Width and height of each data set; images of N-Caltech101 differ, none is larger."""
+"""Resolution by data set; images of N-Caltech101 differ, and none is larger."""
 
 NO_ROW, PAUSE_US = 240, 2**13
-"""Row of a record that is no event, and the time it stands for."""
+"""Row of a record that is no event, and the time that it stands for."""
 
 
 def open_nmnist(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open a file of N-MNIST or N-Caltech101.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size`; see `SIZES`.
 
     Raises:
-        CaptureError: It is no such file, or the size is not given.
+        CaptureError: The file is no such file, or the resolution was not given.
     """
     path = Path(path)
-    trouble = ReadLog()
-    if len(head(path, RECORD)) < RECORD:
+    log = ReadLog()
+    if len(read_head(path, RECORD)) < RECORD:
         raise CaptureError(
             "the file holds no event", where=path, got="less than 5 bytes", do="copy it again"
         )
-    size = known_size(None, options.size, path)
+    size = resolve_size(None, options.size, path)
 
-    def pieces(noted: ReadLog) -> Iterator[RawChunk]:
+    def raw_chunks(pass_log: ReadLog) -> Iterator[RawChunk]:
         rest, paused_us = b"", 0
-        for block in chain(blocks(path), [b""]):
+        for block in chain(read_blocks(path), [b""]):
             rest += block
             records = np.frombuffer(rest, np.uint8, len(rest) // RECORD * RECORD)
             rest = rest[len(records) :]
@@ -320,13 +320,13 @@ def open_nmnist(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Record
             t_us = ((high & 0x7F) << 16 | middle << 8 | low) + pauses
             p = np.where(high >> 7, 1, -1).astype(np.int8)
             yield RawChunk(x.astype(np.uint16), y.astype(np.uint16), t_us, p)[y != NO_ROW]
-        noted.note("torn records", int(len(rest) > 0))
+        pass_log.note("truncated records", int(len(rest) > 0))
 
     def events() -> Chunks:
-        noted = trouble.anew("events")
-        return joined(pieces(noted), size, where=path, trouble=noted)
+        pass_log = log.start("events")
+        return merge_chunks(raw_chunks(pass_log), size, where=path, log=pass_log)
 
-    return Recording(path, "N-MNIST", size=size, events=events, trouble=trouble)
+    return Recording(path, "N-MNIST", size=size, events=events, log=log)
 
 
 NPZ = Format(

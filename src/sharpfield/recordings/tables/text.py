@@ -1,13 +1,13 @@
-"""Events as text, one per line: RPG's events.txt, plain or zipped, v2e's, and tables with commas.
+"""Text files with one event per line: RPG's events.txt, plain or zipped, v2e's text, and CSV.
 
-    t x y p     in this order unless a line of names says otherwise; t in seconds
-    # ...       remarks, also with %
-    240 180     a first line of two numbers is the size of the sensor (E2VID)
+    t x y p     in this order unless a header line names the columns; t in seconds
+    # ...       comments, also with %
+    240 180     a first line of two numbers is the sensor resolution (E2VID)
     %geometry:1280,720          so is this (Prophesee)
-    t_us,x,y,p  a line of names, as our own tables have
+    t_us,x,y,p  a header line, as our own tables have
 
-Times with a decimal point are seconds; whole ones may be anything, unless the line of names tells
-(t_s, t_ms, t_us, t_ns), so the unit is asked for.
+Times with a decimal point are seconds. Whole numbers may be of any unit, so it must be given,
+unless the header line names it (t_s, t_ms, t_us, t_ns).
 
 Source: Mueggler et al., *The event-camera dataset and simulator* (IJRR 2017); Hu et al., *v2e*
 (CVPRW 2021); Rebecq et al., *E2VID* (TPAMI 2021).
@@ -25,28 +25,28 @@ from pathlib import Path
 import numpy as np
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.bytes import BLOCK, ZIP, blocks, head, zip_holds
-from sharpfield.recordings.chunks import CHUNK, RawChunk, Reorder, joined, known_size
+from sharpfield.recordings.bytes import BLOCK, ZIP, read_blocks, read_head, zip_holds
+from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
 from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.recording import Chunks, ReadLog, Recording
 from sharpfield.recordings.tables.text_decode import (
-    BAD,
-    BAD_LINE,
+    EVENTS,
+    FIRST_INVALID,
+    INVALID,
     LINES,
     MINUSES,
-    REMEMBERED,
-    SEEN,
+    STATE_SIZE,
     ZEROS,
     decode_lines,
 )
 from sharpfield.recordings.video import open_images
 from sharpfield.storage.event_columns import UNITS, known_unit
 
-USUAL = "txyp"
-"""Order of the columns where nothing else is said."""
+DEFAULT_COLUMNS = "txyp"
+"""Order of the columns without a header line."""
 
 POWERS = {"s": 6, "ms": 3, "us": 0, "ns": -3}
-"""Powers of ten that make us of a unit."""
+"""Power of ten that converts a unit to us."""
 
 NAMES = {
     **dict.fromkeys(("timestamp", "time", "ts", "t"), "t"),
@@ -54,78 +54,78 @@ NAMES = {
     "x": "x",
     "y": "y",
 }
-"""Columns by what tables call them."""
+"""Column by its name in header lines."""
 
 SIZE = re.compile(r"[#%] *geometry *[:=]? *([0-9]{1,5}) *[xX,] *([0-9]{1,5})")
-"""A remark that gives the size of the sensor."""
+"""A comment that gives the sensor resolution."""
 
 NAME = re.compile(rf"(?P<name>{'|'.join(NAMES)})[_\[(]*(?P<unit>s|ms|us|ns)?[\])]?")
 
-WHOLE_HEAD, LONGEST = 2**16, 2**12
-"""Most bytes of remarks at the beginning, and of a line."""
+MAX_HEADER, MAX_LINE = 2**16, 2**12
+"""Most bytes of the lines before the first event, and of a line."""
 
-BAD_LINES, BAD_SHARE = 100, 0.01
-"""More unreadable lines than this, and than this share of all, mean that it is no such text."""
+MAX_INVALID_LINES, MAX_INVALID_SHARE = 100, 0.01
+"""More invalid lines than this, and than this share of all, mean that the file holds no events."""
 
 UNREADABLE = (
     *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError),
     *(KeyError, ValueError, NotImplementedError, RuntimeError),
 )
-"""What an archive that is damaged, locked or packed in an odd way raises."""
+"""Errors of an archive that is damaged, encrypted or compressed in an unknown way."""
 
 Blocks = Callable[[ReadLog], Iterator[bytes]]
-"""Starts reading the text anew, and notes what is damaged."""
+"""Reads the text from the beginning; counts damage in the log."""
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """What the lines before the first event say."""
+class TextHeader:
+    """Content of the lines before the first event."""
 
     length: int = 0
-    """Bytes up to the first event or remark that has to be read as such."""
+    """Bytes before the first line that the event parser can read."""
     size: tuple[int, int] | None = None
     columns: str = ""
     unit: str = ""
 
 
 def open_text(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording:
-    """Open a text of events, or a zip archive that holds one.
+    """Open a text file of events, or a zip archive that holds one.
 
     Args:
-        path: Of the file.
+        path: The file.
         options: `size` and `unit`, where the text does not give them; `columns`, their order, where
             the text does not name them.
 
     Raises:
-        CaptureError: It is no such file, or size or unit are not known.
-        OptionError: There is no such unit, or no such order of columns.
+        CaptureError: The file holds no such text, or its resolution or unit is unknown.
+        OptionError: The unit or the order of the columns is unknown.
     """
     path, columns = Path(path), options.columns
-    trouble = ReadLog()
-    read = _zipped(path) if head(path, 4) == ZIP else lambda noted: blocks(path)
+    log = ReadLog()
+    read = _zipped(path) if read_head(path, 4) == ZIP else lambda pass_log: read_blocks(path)
     start = next(read(ReadLog()), b"")
-    begin = _beginning(start[:WHOLE_HEAD])
-    order = begin.columns or columns or USUAL
-    if sorted(order) != sorted(USUAL):
+    header = _header(start[:MAX_HEADER])
+    order = header.columns or columns or DEFAULT_COLUMNS
+    if sorted(order) != sorted(DEFAULT_COLUMNS):
         raise OptionError("columns are t, x, y and p in some order", got=order, do="e.g. xytp")
-    if columns and begin.columns and columns != begin.columns:
+    if columns and header.columns and columns != header.columns:
         raise CaptureError(
             "the columns given are not those in the file",
             where=path,
-            got=f"{columns} given, {begin.columns} in the file",
+            got=f"{columns} given, {header.columns} in the file",
             do="leave the columns out",
         )
-    time = _first(start[begin.length : WHOLE_HEAD], order.index("t"))
-    unit = known_unit(options.unit) if options.unit else begin.unit or _unit(time, path)
-    size = known_size(begin.size, options.size, path)
-    layout = np.array([*(order.index(name) for name in USUAL), POWERS[unit]], np.int64)
+    time = _first(start[header.length : MAX_HEADER], order.index("t"))
+    unit = known_unit(options.unit) if options.unit else header.unit or _unit(time, path)
+    size = resolve_size(header.size, options.size, path)
+    layout = np.array([*(order.index(name) for name in DEFAULT_COLUMNS), POWERS[unit]], np.int64)
 
     def events() -> Chunks:
-        noted = trouble.anew("events")
-        pieces = _pieces(_from(begin.length, read(noted)), layout, path, noted)
-        return joined(pieces, size, where=path, trouble=noted)
+        pass_log = log.start("events")
+        pieces = _raw_chunks(_from(header.length, read(pass_log)), layout, path, pass_log)
+        return merge_chunks(pieces, size, where=path, log=pass_log)
 
-    return Recording(path, "text", size=size, events=events, trouble=trouble)
+    return Recording(path, "text", size=size, events=events, log=log)
 
 
 def open_rpg_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -139,29 +139,29 @@ def open_rpg_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recordin
     return replace(events, path=path, frames=open_images(path).frames if listed else None)
 
 
-def _beginning(text: bytes) -> Beginning:
-    """What comes before the first event."""
-    at, found = (3 if text.startswith(b"\xef\xbb\xbf") else 0), Beginning()
+def _header(text: bytes) -> TextHeader:
+    """Parse the lines before the first event."""
+    at, header = (3 if text.startswith(b"\xef\xbb\xbf") else 0), TextHeader()
     while (stop := text.find(b"\n", at)) >= 0:
         line = text[at:stop].decode("latin-1").strip()
         words = re.split(r"[\s,;]+", line)
         if sized := SIZE.fullmatch(line):
-            found = replace(found, size=(int(sized[1]), int(sized[2])))
+            header = replace(header, size=(int(sized[1]), int(sized[2])))
         elif len(words) == 2 and all(re.fullmatch("[0-9]{1,5}", word) for word in words):
-            found = replace(found, length=stop + 1, size=(int(words[0]), int(words[1])))
+            header = replace(header, length=stop + 1, size=(int(words[0]), int(words[1])))
         elif words[0][:1] not in ("", "#", "%"):
             named = [NAME.fullmatch(word.lower()) for word in words]
             order = "".join(NAMES[match["name"]] if match else "?" for match in named)
-            if sorted(order) != sorted(USUAL):
+            if sorted(order) != sorted(DEFAULT_COLUMNS):
                 break
             unit = "".join(match["unit"] or "" for match in named if match)
-            found = replace(found, length=stop + 1, columns=order, unit=unit)
+            header = replace(header, length=stop + 1, columns=order, unit=unit)
         at = stop + 1
-    return found
+    return header
 
 
 def _first(text: bytes, column: int) -> str:
-    """The time of the first event; empty if there is none."""
+    """Time of the first event as text; empty if there is none."""
     for line in text.decode("latin-1").splitlines():
         words = re.split(r"[\s,;]+", line.strip())
         if words[0][:1] not in ("", "#", "%") and len(words) > column:
@@ -180,37 +180,37 @@ def _unit(time: str, path: Path) -> str:
     )
 
 
-def _pieces(
-    data: Iterator[bytes], layout: np.ndarray, path: Path, trouble: ReadLog
+def _raw_chunks(
+    data: Iterator[bytes], layout: np.ndarray, path: Path, log: ReadLog
 ) -> Iterator[RawChunk]:
-    room, state = Reorder(), np.zeros(REMEMBERED, np.int64)
-    rest, told = b"", 0
+    buffer, state = ReorderBuffer(), np.zeros(STATE_SIZE, np.int64)
+    rest, invalid = b"", 0
     for block in chain(data, [None]):
         rest += b"\n" if block is None else block
         while True:
             text = np.frombuffer(rest, np.uint8)
-            used, room.end = decode_lines(text, state, layout, room.columns, room.end)
+            used, buffer.end = decode_lines(text, state, layout, buffer.columns, buffer.end)
             rest = rest[used:]
             _expect_events(state, path)
-            trouble.note("lines that could not be read", int(state[BAD]) - told)
-            told = int(state[BAD])
-            if room.end < CHUNK:
+            log.note("lines that could not be read", int(state[INVALID]) - invalid)
+            invalid = int(state[INVALID])
+            if buffer.end < CHUNK:
                 break
-            yield room.taken(last=False)
-        if len(rest) > LONGEST:
+            yield buffer.flush(last=False)
+        if len(rest) > MAX_LINE:
             rest = b""
-            state[BAD] += 1
-    yield room.taken(last=True)
+            state[INVALID] += 1
+    yield buffer.flush(last=True)
 
 
 def _expect_events(state: np.ndarray, path: Path) -> None:
-    """Make sure that most lines are events, and that polarities are of one kind."""
-    bad, seen, lines = (int(state[place]) for place in (BAD, SEEN, LINES))
-    if bad > max(BAD_LINES, BAD_SHARE * lines) or (bad and not seen):
+    """Check that most lines are events, and that polarity has two values."""
+    invalid, events, lines = (int(state[i]) for i in (INVALID, EVENTS, LINES))
+    if invalid > max(MAX_INVALID_LINES, MAX_INVALID_SHARE * lines) or (invalid and not events):
         raise CaptureError(
             "lines are no events of four numbers: time, column, row and polarity",
-            where=f"{path}, line {state[BAD_LINE]}",
-            got=f"{bad} of {lines} lines are none",
+            where=f"{path}, line {state[FIRST_INVALID]}",
+            got=f"{invalid} of {lines} lines are none",
             do="check which column is which; columns and rows are whole, polarity is 0, 1 or -1",
         )
     if state[ZEROS] and state[MINUSES]:
@@ -223,17 +223,17 @@ def _expect_events(state: np.ndarray, path: Path) -> None:
 
 
 def _from(start: int, data: Iterator[bytes]) -> Iterator[bytes]:
-    """Blocks but for the first bytes."""
+    """Blocks without the first `start` bytes."""
     for block in data:
         yield block[start:]
         start = max(start - len(block), 0)
 
 
 def _zipped(path: Path) -> Blocks:
-    """What reads the only text of an archive.
+    """Find the text of events in a zip archive, and return the function that reads it.
 
     Raises:
-        CaptureError: There is none, or more than one, or it cannot be unpacked.
+        CaptureError: There is none or more than one, or it cannot be decompressed.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -252,13 +252,13 @@ def _zipped(path: Path) -> Blocks:
             "cannot read the archive", where=path, got=error, do="copy or pack it again"
         ) from None
 
-    def read(noted: ReadLog) -> Iterator[bytes]:
+    def read(pass_log: ReadLog) -> Iterator[bytes]:
         try:
             with zipfile.ZipFile(path) as archive, archive.open(named[0]) as file:
                 while block := file.read(BLOCK):
                     yield block
         except UNREADABLE:
-            noted.note("damaged archives, read up to the damage")
+            pass_log.note("damaged archives, read up to the damage")
 
     return read
 

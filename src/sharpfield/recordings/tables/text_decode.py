@@ -1,7 +1,7 @@
-"""Lines of four numbers, an event each, parsed as they are: no float on the way to microseconds.
+"""Parser for lines of four numbers, one event each, in integer arithmetic.
 
-A number is kept as a whole mantissa and a power of ten, `13.582595999` as 13582595999 and -9, so
-that times come out as exact as the text has them (nearest us, halves upwards).
+A number is kept as an integer mantissa and a power of ten, `13.582595999` as 13582595999 and -9, so
+that times are as exact as the text has them (rounded to the nearest us, halves upwards).
 """
 
 from typing import no_type_check
@@ -9,24 +9,24 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-LINES, BAD, BAD_LINE, ZEROS, MINUSES, SEEN = range(6)
-"""What a parser remembers: lines so far, how many could not be read and the first of them, whether
-a polarity was 0 and whether one was -1, and events so far."""
+LINES, INVALID, FIRST_INVALID, ZEROS, MINUSES, EVENTS = range(6)
+"""Parser state: number of lines, of invalid ones and the first of them, whether a polarity was 0
+and whether one was -1, and number of events."""
 
-REMEMBERED = 6
-"""How many numbers that is."""
+STATE_SIZE = 6
+"""Length of the state array."""
 
 DIGITS = 18
-"""Those that an int64 surely holds; further ones are dropped."""
+"""Digits that an int64 always holds; further digits are dropped."""
 
 TENS = 10 ** np.arange(DIGITS + 1)
 """Powers of ten."""
 
 FULL = 10 ** (DIGITS - 1)
-"""The least mantissa that takes no more digits."""
+"""Smallest mantissa that takes no more digits."""
 
 OUTSIDE = 0xFFFF
-"""Column or row of what no 16-bit number holds."""
+"""Column or row of coordinates that do not fit in 16 bits."""
 
 NEWLINE, POINT, MINUS, PLUS, ZERO, NINE = (ord(sign) for sign in "\n.-+09")
 HASH, PERCENT, SMALL_E, LARGE_E = (ord(sign) for sign in "#%eE")
@@ -38,14 +38,14 @@ def decode_lines(text, state, layout, columns, end):
     """Parse whole lines.
 
     Args:
-        text: Bytes; what follows the last newline is left.
-        state: `REMEMBERED` numbers, zero at first; updated.
-        layout: In which column t, x, y and p are, and the power of ten that makes times us.
-        columns: x, y, t and p, written from `end` on until they are full.
-        end: How many events there are already.
+        text: Bytes; those after the last newline are not used.
+        state: `STATE_SIZE` numbers, initially zero; updated.
+        layout: Column index of t, x, y and p, and the power of ten that converts times to us.
+        columns: x, y, t and p, written from index `end` on until they are full.
+        end: Number of events in the columns.
 
     Returns:
-        How many bytes were used up, and how many events there are now.
+        Number of bytes used, and of events in the columns.
     """
     x, y, t, p = columns
     mantissa, power = np.empty(4, np.int64), np.empty(4, np.int64)
@@ -61,33 +61,33 @@ def decode_lines(text, state, layout, columns, end):
         at_line, at = at, stop + 1
         if first == stop or text[first] == HASH or text[first] == PERCENT:
             continue
-        good = _numbers(text, at_line, stop, mantissa, power)
-        if good:
-            time, good = _whole_us(mantissa[layout[0]], power[layout[0]] + layout[4])
-        if good:
-            x[end], good = _pixel(mantissa[layout[1]], power[layout[1]])
-        if good:
-            y[end], good = _pixel(mantissa[layout[2]], power[layout[2]])
-        if good:
-            sign, good = _pixel(abs(mantissa[layout[3]]), power[layout[3]])
-            good = good and sign <= 1
-        if not good:
-            state[BAD_LINE] = state[LINES] if state[BAD] == 0 else state[BAD_LINE]
-            state[BAD] += 1
+        valid = _numbers(text, at_line, stop, mantissa, power)
+        if valid:
+            time, valid = _whole_us(mantissa[layout[0]], power[layout[0]] + layout[4])
+        if valid:
+            x[end], valid = _pixel(mantissa[layout[1]], power[layout[1]])
+        if valid:
+            y[end], valid = _pixel(mantissa[layout[2]], power[layout[2]])
+        if valid:
+            sign, valid = _pixel(abs(mantissa[layout[3]]), power[layout[3]])
+            valid = valid and sign <= 1
+        if not valid:
+            state[FIRST_INVALID] = state[LINES] if state[INVALID] == 0 else state[FIRST_INVALID]
+            state[INVALID] += 1
             continue
         bright = sign == 1 and mantissa[layout[3]] > 0
         state[ZEROS] |= sign == 0
         state[MINUSES] |= sign == 1 and not bright
         t[end], p[end] = time, 1 if bright else -1
         end += 1
-        state[SEEN] += 1
+        state[EVENTS] += 1
     return at, end
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _skip(text, at, stop):
-    """The next place that holds no separator."""
+    """Index of the next byte that is no separator."""
     while at < stop:
         sign = text[at]
         if sign != 32 and sign != 9 and sign != 13 and sign != 44 and sign != 59:  # space \t \r , ;
@@ -99,7 +99,7 @@ def _skip(text, at, stop):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _numbers(text, at, stop, mantissa, power):
-    """Read exactly four numbers; whether there were."""
+    """Parse exactly four numbers; False if the line is anything else."""
     for k in range(4):
         at = _skip(text, at, stop)
         start = at
@@ -150,7 +150,7 @@ def _exponent(text, at, stop):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _whole_us(mantissa, power):
-    """The nearest whole number, and whether an int64 holds it with room to spare."""
+    """Nearest integer, and whether it is within 2^62."""
     if mantissa == 0 or power < -DIGITS:
         return 0, True
     if power >= 0:
@@ -164,7 +164,7 @@ def _whole_us(mantissa, power):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _pixel(mantissa, power):
-    """A whole number as a place on the sensor, and whether it is whole."""
+    """Pixel coordinate, and whether it is an integer."""
     if power < 0:
         unit = TENS[min(-power, DIGITS)]
         if mantissa % unit:

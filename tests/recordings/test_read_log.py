@@ -38,7 +38,7 @@ NARROW = (WIDTH - 1, HEIGHT)
 Make = Callable[[Path], Recording]
 
 
-def torn(case: str, layout: str) -> Make:
+def truncated(case: str, layout: str) -> Make:
     """A file that ends early."""
 
     def make(folder: Path) -> Recording:
@@ -102,13 +102,13 @@ def images(folder: Path) -> Recording:
 
 
 MAKE: dict[str, Make] = {
-    "evt": torn("evt3", "evt"),
-    "dat": torn("dat", "dat"),
-    "aedat2": torn("aedat2", "aedat2"),
-    "aedat3": torn("aedat3", "aedat3"),
-    "aedat4": torn("aedat4-none", "aedat4"),
-    "rosbag": torn("rosbag-ros1", "rosbag"),
-    "nmnist": torn("nmnist", "nmnist"),
+    "evt": truncated("evt3", "evt"),
+    "dat": truncated("dat", "dat"),
+    "aedat2": truncated("aedat2", "aedat2"),
+    "aedat3": truncated("aedat3", "aedat3"),
+    "aedat4": truncated("aedat4-none", "aedat4"),
+    "rosbag": truncated("rosbag-ros1", "rosbag"),
+    "nmnist": truncated("nmnist", "nmnist"),
     "text": text,
     "rpg-folder": rpg,
     "hdf5": hdf5,
@@ -129,7 +129,7 @@ def read_all(recording: Recording) -> str:
         list(recording.frames())
     if recording.triggers:
         recording.triggers()
-    return str(recording.trouble)
+    return str(recording.log)
 
 
 @pytest.mark.parametrize("layout", FORMATS)
@@ -147,17 +147,17 @@ def test_reading_again_tells_the_same(tmp_path: Path, layout: str) -> None:
 
 
 def test_readings_beside_each_other() -> None:
-    trouble = ReadLog()
-    trouble.note("odd headers")
+    log = ReadLog()
+    log.note("odd headers")
     for _ in range(2):
-        events, frames = trouble.anew("events"), trouble.anew("frames")
-        events.note("torn ends of the file")
+        events, frames = log.start("events"), log.start("frames")
+        events.note("truncated ends of the file")
         frames.note("damaged frames", 3)
-        frames.note("torn ends of the file")
-        assert trouble.counts == {
+        frames.note("truncated ends of the file")
+        assert log.counts == {
             "odd headers": 1,
-            "torn ends of the file": 1,
+            "truncated ends of the file": 1,
             "damaged frames": 3,
         }
-    assert not trouble.anew("events").counts
-    assert str(trouble) == "1 odd headers, 3 damaged frames, 1 torn ends of the file"
+    assert not log.start("events").counts
+    assert str(log) == "1 odd headers, 3 damaged frames, 1 truncated ends of the file"
