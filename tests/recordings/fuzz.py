@@ -70,7 +70,7 @@ def check(open_function: Open, path: Path, *, case: Case | None = None) -> str:
     """Read all that a file may hold, and make sure that the outcome is one of the allowed.
 
     Returns:
-        "refused" (by a CaptureError), "partial" (with `trouble` noted) or "whole".
+        "refused" (by a CaptureError), "partial" (with counts in `log`) or "whole".
 
     Raises:
         AssertionError: Events are unsound, or more than the bytes can hold, or it took too long or

@@ -1,4 +1,4 @@
-"""One rule for all formats: however often a recording is read, the same trouble is told once."""
+"""One rule for all formats: however often a recording is read, what was left out counts once."""
 
 from collections.abc import Callable
 from pathlib import Path

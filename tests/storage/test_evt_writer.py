@@ -46,7 +46,7 @@ def written(path: Path, events: EventStream, encoding: str, cuts: list[int] | No
 def expect_equal(path: Path, events: EventStream) -> None:
     recording = open_evt(path)
     found = recording.load()
-    assert recording.size == (events.width, events.height) and not str(recording.trouble)
+    assert recording.size == (events.width, events.height) and not str(recording.log)
     for name in ("x", "y", "t_us", "p"):
         np.testing.assert_array_equal(getattr(found, name), getattr(events, name))
 

@@ -7,7 +7,7 @@ from sharpfield.core.frames import Exposure
 from sharpfield.preparation.ingest.clock import find_offset, shifted, triggered, with_length
 from sharpfield.recordings.recording import Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.simulation.sensors.events import EventPixels, merge_chunks
+from sharpfield.simulation.sensors.events import EventPixels, joined
 
 SECONDS, FRAMES, INTERVAL_US = 6, 150, 33_333
 
@@ -62,7 +62,7 @@ def shaken(seed: int, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     change = np.abs(np.diff(np.log(np.maximum(light, 1 / 255)), axis=0)).mean(
         (1, 2), dtype=np.float64
     )
-    return change, opens_us + 5000, np.bincount(merge_chunks(gaps, (48, 32)).t_us // 1000)
+    return change, opens_us + 5000, np.bincount(joined(gaps, (48, 32)).t_us // 1000)
 
 
 def test_the_search_itself_is_not_late_but_events_of_high_thresholds_are():
