@@ -17,7 +17,7 @@ from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
-from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start

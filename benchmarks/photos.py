@@ -18,7 +18,7 @@ from sharpfield.captures.read import read_capture
 from sharpfield.captures.summary import downscaled
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
-from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start

@@ -21,7 +21,7 @@ from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import parse_size
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure
-from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start

@@ -14,7 +14,7 @@ import torch
 import tyro
 
 from sharpfield.metrics.image import psnr
-from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.rendering.view import render_view
 from sharpfield.report.colormaps import eight_bit
 from sharpfield.simulation.static_capture import Rig, Timing, simulate

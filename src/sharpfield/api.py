@@ -16,8 +16,8 @@ from sharpfield.core.errors import OptionError
 from sharpfield.preparation.deblur import DeblurOptions, Deblurred, deblur_to
 from sharpfield.preparation.deblur import deblur as deblur_capture
 from sharpfield.recipes import recipe_named
-from sharpfield.recipes.choose import prepared
-from sharpfield.recipes.options import with_options
+from sharpfield.recipes.settings.options import with_options
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.recordings.open import open_recording
 from sharpfield.runs.captures import LayoutName, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named

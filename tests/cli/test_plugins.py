@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from sharpfield.core.paper import Paper
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.volume.scene import VolumeOptions
 

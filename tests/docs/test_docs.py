@@ -19,8 +19,8 @@ import pytest
 from sharpfield.cli import main as command_line
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.choose import presets_of
-from sharpfield.recipes.options import changed
+from sharpfield.recipes.settings.options import changed
+from sharpfield.recipes.settings.presets import presets_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "notebook.md"]

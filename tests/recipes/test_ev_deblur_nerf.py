@@ -9,9 +9,9 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes.choose import prepared
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF
 from sharpfield.recipes.nerf import NeRF
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.recipes.volume.scene import VolumeOptions
 from sharpfield.rendering.view import render_view
 from sharpfield.training.loop import fit

@@ -17,8 +17,8 @@ from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.cli.runs import OPTIONS, Choice
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.recipes.choose import prepared
-from sharpfield.recipes.options import changed, with_options
+from sharpfield.recipes.settings.options import changed, with_options
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.recipes.splats.merge import merge
 from sharpfield.runs.config import (
     RunConfig,

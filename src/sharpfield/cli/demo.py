@@ -13,7 +13,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.evaluation.tables import methods_table
 from sharpfield.preparation.deblur import DeblurOptions, deblur
-from sharpfield.recipes.choose import prepared
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.report.tables import markdown
 from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run

@@ -15,8 +15,8 @@ import tyro
 
 from sharpfield.core.errors import Hint, OptionError, did_you_mean
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.choose import presets_of
-from sharpfield.recipes.options import changed, field_texts, new_name, options_of
+from sharpfield.recipes.settings.options import changed, field_texts, new_name, options_of
+from sharpfield.recipes.settings.presets import presets_of
 
 NOT_FLAGS = ("steps",)
 """Fields of recipes that have a flag of the command: `--steps` also stretches the schedule."""

@@ -7,8 +7,8 @@ from tyro.conf import Positional
 
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named, summaries, summary_of
-from sharpfield.recipes.choose import presets_of
-from sharpfield.recipes.options import Option, options_of
+from sharpfield.recipes.settings.options import Option, options_of
+from sharpfield.recipes.settings.presets import presets_of
 
 WIDTH = 96
 COLUMN = 34

@@ -19,8 +19,8 @@ from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.evaluation.paths import camera_path
 from sharpfield.evaluation.refine import Refinement
 from sharpfield.metrics.lpips import load_lpips
-from sharpfield.recipes.choose import prepared
-from sharpfield.recipes.options import changed, with_options
+from sharpfield.recipes.settings.options import changed, with_options
+from sharpfield.recipes.settings.presets import prepared
 from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.video import write_video
 from sharpfield.runs.config import RunConfig, device_named

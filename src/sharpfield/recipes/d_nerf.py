@@ -19,7 +19,7 @@ from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
 from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene

@@ -10,7 +10,7 @@ from typing import ClassVar, TypeVar
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.splats.dynamic_model import DynamicModel
 from sharpfield.recipes.splats.dynamic_scene import DynamicOptions
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions

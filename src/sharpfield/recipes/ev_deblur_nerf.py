@@ -20,7 +20,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.core.tone import tone_of
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.event_term import EventOptions, EventTerm
 from sharpfield.recipes.volume.frame_terms import (
     FrameOptions,

@@ -22,7 +22,7 @@ from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
 from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene

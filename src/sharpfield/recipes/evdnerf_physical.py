@@ -29,7 +29,7 @@ from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes import evdnerf
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.voxel_scene import MovingOptions, MovingScene
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table

@@ -24,12 +24,12 @@ from sharpfield.formation.patch_kernel import (
 )
 from sharpfield.metrics.quality import Judge, frame_weights
 from sharpfield.recipes import point_nerf
-from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.points.hybrid_checkpoint import load_released
 from sharpfield.recipes.points.images import ImageBranch, SourceOptions
 from sharpfield.recipes.points.model import DrawOptions, PointModel
 from sharpfield.recipes.points.scene import PointScene
+from sharpfield.recipes.settings.presets import Presets
 
 PAPER = Paper(
     key="dai2023hybrid",

@@ -17,7 +17,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.core.tone import tone_of
-from sharpfield.recipes.choose import Presets
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import FrameOptions, KernelTerm, Terms
 from sharpfield.recipes.volume.scene import DRAFT, GRID_RATE, STANDARD, Volume, VolumeOptions
 

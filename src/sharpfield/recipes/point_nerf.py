@@ -11,10 +11,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.paper import Paper
 from sharpfield.fields.points.networks import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions
-from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.model import DrawOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions, PointScene
+from sharpfield.recipes.settings.presets import Presets
 
 R = TypeVar("R", bound="PointNeRF")
 

@@ -23,8 +23,8 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
 from sharpfield.initialisation.posed_images import sharp_light_images
-from sharpfield.recipes.choose import Presets
 from sharpfield.recipes.hybrid import PAPER
+from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
 from sharpfield.recipes.splats.scene import GaussianOptions

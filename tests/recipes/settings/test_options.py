@@ -7,8 +7,8 @@ import pytest
 
 from sharpfield.core.errors import Hint, OptionError
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.choose import Presets
-from sharpfield.recipes.options import changed, current_name, options_of, with_options
+from sharpfield.recipes.settings.options import changed, current_name, options_of, with_options
+from sharpfield.recipes.settings.presets import Presets
 
 
 @dataclass(frozen=True)
