@@ -11,13 +11,17 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 RUNS = {
-    "00_a_sharp_scene": (("--size", "24", "16", "--steps", "2"), "wrote a_sharp_scene.png"),
-    "01_blur_it": (("--size", "24", "16"), "wrote blur_it.png"),
-    "02_make_events": ((), "wrote events.png"),
+    "01_a_sharp_scene": (("--size", "24", "16", "--steps", "2"), "wrote a_sharp_scene.png"),
+    "02_blur_it": (("--size", "24", "16"), "wrote blur_it.png"),
+    "03_make_events": ((), "wrote events.png"),
     "04_your_capture": (("--size", "16", "12"), "divide them by 1000"),
     "05_your_paper": (("--size", "24", "16", "--steps", "25"), "step   24  blur"),
 }
 """What each is run with, and what it says at the end."""
+
+TEN_LINES = ROOT / "examples" / "00_ten_lines.py"
+SMALLER = {"size=(120, 80), frames=18": "size=(24, 16), frames=4", "minutes=1": "steps=5"}
+"""How the first example is cut down, as it takes no options."""
 
 LINES = 60
 
@@ -25,13 +29,7 @@ LINES = 60
 @pytest.mark.parametrize("name", RUNS)
 def test_runs(name: str, tmp_path: Path) -> None:
     options, said = RUNS[name]
-    done = subprocess.run(
-        [sys.executable, ROOT / "examples" / f"{name}.py", *options],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-    )
+    done = python([ROOT / "examples" / f"{name}.py", *options], tmp_path)
     assert done.returncode == 0, done.stderr
     assert said in done.stdout
     for line in done.stdout.splitlines():
@@ -39,11 +37,35 @@ def test_runs(name: str, tmp_path: Path) -> None:
             assert (tmp_path / line.split()[1]).stat().st_size > 0
 
 
+def test_ten_lines_do_everything(tmp_path: Path) -> None:
+    text = TEN_LINES.read_text()
+    for long, short in SMALLER.items():
+        assert long in text
+        text = text.replace(long, short)
+    done = python(["-c", text], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "held-out views" in done.stdout and (tmp_path / "ten_lines.ply").exists()
+    assert (tmp_path / "runs" / "ten_lines" / "report.html").exists()
+    imports = [line for line in text.splitlines() if line.startswith(("import", "from"))]
+    assert imports == ["import sharpfield as sf"] and code_lines(TEN_LINES) <= 10
+
+
 def test_numbered_examples_are_all_run_and_short() -> None:
     numbered = sorted((ROOT / "examples").glob("[0-9]*.py"))
-    assert {path.stem for path in numbered} == RUNS.keys()
+    assert {path.stem for path in numbered} == {TEN_LINES.stem, *RUNS}
     for path in numbered:
         assert code_lines(path) < LINES, path.name
+
+
+def python(words: list[str | Path], folder: Path) -> subprocess.CompletedProcess[str]:
+    """What the interpreter says, run in a folder."""
+    return subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
 
 
 def code_lines(path: Path) -> int:

@@ -103,10 +103,10 @@ class Struct:
 
 def one_line(record: Any) -> str:
     """A dataclass as text, its arrays and tensors by their shapes alone."""
-    shown = []
+    shown: list[str] = []
     for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        shape = getattr(value, "shape", None)
+        value: Any = getattr(record, field.name)
+        shape: Any = getattr(value, "shape", None)
         if value is not None:
             text = repr(value) if shape is None or isinstance(value, Struct) else str([*shape])
             shown.append(f"{field.name}={text}")

@@ -1,6 +1,6 @@
 """From blurry frames and events to a sharp scene.
 
-    python examples/00_a_sharp_scene.py
+    python examples/01_a_sharp_scene.py
 
 records a scene with a shaky camera, learns it for some seconds, and writes `a_sharp_scene.png`: a
 blurry frame, the learned scene from the same place, and what was really there. The same from the

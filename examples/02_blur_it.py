@@ -1,6 +1,6 @@
 """Blur is the mean of sharp light: the one formula, on a scene whose light is known.
 
-    python examples/01_blur_it.py
+    python examples/02_blur_it.py
 
 asks which sharp rays explain each pixel (`expose`), looks up their light, and asks what the frame
 would store (`observe`), for longer and longer exposures: `blur_it.png`. The last is compared with

@@ -1,6 +1,6 @@
 """Watch a scene with an event camera, and with a frame camera beside it.
 
-    python examples/02_make_events.py
+    python examples/03_make_events.py
 
 writes `events.png`: a blurry frame, the sharp image it should have been, and the events of
 its exposure (red: brighter, blue: darker). The same capture in one line is
