@@ -35,7 +35,8 @@ from benchmarks.table import Row, save, show
 from benchmarks.tiled import tiled
 from sharpfield.events.index import signed_sum
 from sharpfield.recordings.prophesee.evt import open_evt
-from sharpfield.storage.event_cache import cache_folder, event_index, read_events
+from sharpfield.storage.disk_cache import cache_folder
+from sharpfield.storage.event_cache import event_index, read_events
 from sharpfield.storage.event_layouts import open_events
 
 SAMPLE_EVENTS = 219_596

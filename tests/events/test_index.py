@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.events import index as ops
 from sharpfield.events.image import splat_bilinear, splat_nearest, window_image
-from sharpfield.events.index_files import file_key, index_on_disk, site_ranges
 
 WIDTH, HEIGHT = 7, 5
 
@@ -167,51 +165,12 @@ def test_nearest_splat_rounds_halves_up() -> None:
     assert image[0, 2] == 1 and image[4, 0] == 1
 
 
-@pytest.mark.parametrize("held", [1, 50, 10**6])
-def test_index_on_disk_equals_the_one_in_memory(tmp_path, events: EventStream, held: int) -> None:
-    index, stored = ops.build(events), index_on_disk(events, tmp_path / "i", key="a", held=held)
-    for name in ("site_xy", "offset", "t_us", "p"):
-        np.testing.assert_array_equal(getattr(stored, name), getattr(index, name))
-    site = np.arange(index.sites)
-    np.testing.assert_array_equal(
-        ops.next_event(stored, site, site), ops.next_event(index, site, site)
-    )
-
-
-def test_index_on_disk_is_kept_for_its_key_and_replaced_for_another(tmp_path) -> None:
-    folder = tmp_path / "index"
-    assert len(index_on_disk(stream(10), folder, key="a")) == 10
-    assert len(index_on_disk(stream(20), folder, key="a")) == 10
-    assert len(index_on_disk(stream(20), folder, key="b")) == 20
-    assert [path.name for path in tmp_path.iterdir()] == ["index"]
-
-
-def test_unfinished_index_is_not_used(tmp_path) -> None:
-    folder = tmp_path / "index"
-    index_on_disk(stream(10), folder, key="a")
-    (folder / "index.json").unlink()
-    assert len(index_on_disk(stream(20), folder, key="a")) == 20
-
-
-def test_file_key_changes_with_the_file(tmp_path) -> None:
-    file = tmp_path / "events.h5"
-    file.write_bytes(b"a")
-    key = file_key(file)
-    file.write_bytes(b"ab")
-    assert file_key(file) != key
-
-
-def test_site_ranges_cover_all_sites_once() -> None:
-    offset = np.array([0, 3, 3, 10, 11, 12])
-    assert site_ranges(offset, 4) == [(0, 2), (2, 3), (3, 5)]
-
-
-def test_empty_stream(tmp_path) -> None:
+def test_empty_stream() -> None:
     for rectified in (False, True):
         none = stream(1, rectified=rectified)[:0]
-        for index in (ops.build(none), index_on_disk(none, tmp_path / str(rectified), key="a")):
-            assert len(index) == 0 and ops.chains(index)[-1] == 0
-            assert window_image(index, 0, 9, width=WIDTH, height=HEIGHT).sum() == 0
+        index = ops.build(none)
+        assert len(index) == 0 and ops.chains(index)[-1] == 0
+        assert window_image(index, 0, 9, width=WIDTH, height=HEIGHT).sum() == 0
 
 
 def test_event_outside_the_sensor_is_refused() -> None:
@@ -240,9 +199,9 @@ def rig(n: int = 900) -> EventStream:
     return replace(stream(n), track=draw.integers(0, 3, n).astype(np.uint16), tracks=3)
 
 
-def test_each_camera_of_a_rig_has_the_index_of_its_own_stream(tmp_path: Path) -> None:
+def test_each_camera_of_a_rig_has_the_index_of_its_own_stream() -> None:
     events = rig()
-    for index in (ops.build(events), index_on_disk(events, tmp_path / "index", key="k", held=100)):
+    for index in (ops.build(events),):
         assert index.sites == 3 * HEIGHT * WIDTH
         for track in range(3):
             own = replace(events.of_track(track), track=None, tracks=1)

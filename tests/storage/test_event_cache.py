@@ -6,8 +6,14 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.events.index import build
-from sharpfield.storage import event_cache
-from sharpfield.storage.event_cache import cache_folder, event_index, read_events
+from sharpfield.storage import disk_cache, event_cache
+from sharpfield.storage.event_cache import (
+    event_index,
+    open_index,
+    read_events,
+    site_ranges,
+    write_index,
+)
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events
 
@@ -56,7 +62,7 @@ def test_both_ends_are_kept(path):
 
 def test_it_is_built_once(path):
     mapped(path)
-    column = path.parent / "cache" / "events" / "x.npy"
+    (column,) = (path.parent / "cache").glob("events-*/x.npy")
     before = column.stat().st_mtime_ns
     mapped(path)
     assert column.stat().st_mtime_ns == before
@@ -68,6 +74,7 @@ def test_another_file_or_window_builds_it_anew(path, some_events):
     write_events(path, some_events(3_000, seed=5))
     os.utime(path, ns=(1, 1))
     assert len(mapped(path)) == 3_000
+    assert len(list((path.parent / "cache").iterdir())) == 1
 
 
 def test_a_build_that_fails_leaves_nothing(path, monkeypatch):
@@ -77,7 +84,7 @@ def test_a_build_that_fails_leaves_nothing(path, monkeypatch):
     monkeypatch.setattr(event_cache.EventFile, "check", fail)
     with pytest.raises(CaptureError, match="unsound"):
         mapped(path, between=(0, 50_000))
-    assert not (path.parent / "cache" / "events").exists()
+    assert list((path.parent / "cache").iterdir()) == []
 
 
 def test_the_index_of_a_mapped_stream_is_kept_beside_it(path):
@@ -85,7 +92,8 @@ def test_the_index_of_a_mapped_stream_is_kept_beside_it(path):
     index, expected = event_index(events), build(events)
     for name in ("site_xy", "offset", "t_us", "p"):
         np.testing.assert_array_equal(getattr(index, name), getattr(expected, name))
-    assert (path.parent / "cache" / "events" / "index").is_dir()
+    (folder,) = (path.parent / "cache").glob("events-*/index-*")
+    assert folder.is_dir() and len(event_index(events)) == len(expected)
 
 
 def test_the_index_of_a_part_is_its_own(path):
@@ -99,10 +107,47 @@ def test_the_index_of_a_loaded_stream_leaves_no_files(path, some_events):
     assert not (path.parent / "cache").exists()
 
 
-def test_a_place_that_cannot_be_written_uses_the_users_cache(path, monkeypatch, tmp_path):
-    assert cache_folder(path) == path.parent / "cache"
-    monkeypatch.setattr(event_cache.os, "access", lambda *_: False)
-    monkeypatch.setattr(event_cache.Path, "home", lambda: tmp_path / "home")
-    assert cache_folder(path).is_relative_to(tmp_path / "home" / ".cache" / "sharpfield")
-    assert len(mapped(path)) == 4_000
+@pytest.mark.parametrize("home", [True, False])
+def test_a_folder_that_cannot_be_written(path, monkeypatch, tmp_path, home):
+    """Events are mapped from the cache of the user, or loaded if that cannot be written either."""
+    monkeypatch.setattr(disk_cache.Path, "home", lambda: tmp_path / "home")
+    refused = {path.parent} if home else {path.parent, tmp_path}
+    (tmp_path / "home").mkdir()
+    refused |= set() if home else {tmp_path / "home"}
+    monkeypatch.setattr(disk_cache.os, "access", lambda folder, _: folder not in refused)
+    events = mapped(path)
+    assert len(events) == 4_000 and isinstance(events.t_us, np.memmap) == home
+    assert len(event_index(events)) == 4_000
     assert not (path.parent / "cache").exists()
+
+
+# The index on disk
+
+
+@pytest.mark.parametrize("at_once", [1, 50, 10**6])
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_written_index_equals_the_one_in_memory(tmp_path, some_events, at_once, rectified):
+    events = some_events(300)
+    if rectified:
+        events = replace(events, x=events.x.astype(np.float32), y=events.y + np.float32(0.25))
+    write_index(events, tmp_path, at_once=at_once)
+    index, stored = build(events), open_index(tmp_path, 1)
+    for name in ("site_xy", "offset", "t_us", "p"):
+        np.testing.assert_array_equal(getattr(stored, name), getattr(index, name))
+
+
+def test_the_written_index_of_a_rig_and_of_nothing(tmp_path, some_events):
+    events = some_events(300)
+    rig = replace(events, track=(events.t_us % 3).astype(np.uint16), tracks=3)
+    for name, one in (("rig", rig), ("none", events[:0])):
+        (tmp_path / name).mkdir()
+        write_index(one, tmp_path / name, at_once=100)
+        stored, index = open_index(tmp_path / name, one.tracks), build(one)
+        assert len(stored) == len(index) and stored.sites == index.sites
+        np.testing.assert_array_equal(stored.offset, index.offset)
+        np.testing.assert_array_equal(stored.t_us, index.t_us)
+
+
+def test_site_ranges_cover_all_sites_once():
+    offset = np.array([0, 3, 3, 10, 11, 12])
+    assert site_ranges(offset, 4) == [(0, 2), (2, 3), (3, 5)]

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.storage.images import list_images, read_image, read_images, write_image
+from sharpfield.storage.images import (
+    image_stack,
+    list_images,
+    read_image,
+    read_images,
+    write_image,
+)
 
 
 def made_image(dtype=np.uint8, channels=3, size=(4, 6)):
@@ -93,3 +99,31 @@ def test_images_of_two_sizes_are_refused(tmp_path):
     message = "images differ in size or type.*b.png.*6x4 RGB 8 bit and 7x4 RGB 8 bit"
     with pytest.raises(CaptureError, match=re.compile(message, re.DOTALL)):
         read_images(list_images(tmp_path))
+
+
+def test_large_stacks_are_cached_and_mapped(tmp_path):
+    draw = np.random.default_rng(2)
+    images = draw.integers(0, 256, (5, 10, 12, 3)).astype(np.uint8)
+    paths = [tmp_path / "color" / f"{i}.png" for i in range(5)]
+    for path, image in zip(paths, images, strict=True):
+        write_image(path, image)
+    calls = []
+
+    def decode(path):
+        calls.append(path)
+        return read_image(path)
+
+    first = image_stack(paths, decode, sources=paths, kind="colour", in_memory=100)
+    assert isinstance(first, np.memmap) and not first.flags.writeable
+    np.testing.assert_array_equal(first, images)
+    again = image_stack(paths, decode, sources=paths, kind="colour", in_memory=100)
+    np.testing.assert_array_equal(again, images)
+    assert len(calls) == 6, "the second time only the first is decoded, for its size"
+    write_image(paths[4], images[0])
+    changed = image_stack(paths, decode, sources=paths, kind="colour", in_memory=100)
+    np.testing.assert_array_equal(changed[4], images[0])
+    loaded = image_stack(paths[:2], decode, sources=paths[:2], kind="colour")
+    assert not isinstance(loaded, np.memmap)
+    write_image(paths[1], images[1, :4])
+    with pytest.raises(CaptureError, match="images differ in size or type"):
+        image_stack(paths, decode, sources=paths, kind="colour")

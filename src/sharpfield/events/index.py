@@ -7,7 +7,7 @@ site begins. Cameras follow each other: site = track * height * width + row * wi
 "how many events between two times" is two binary searches.
 
 It is built by a counting sort: one pass over the stream counts, one places. All arrays are numpy
-and may be memory-mapped, see `ops.event_index_files`; images of it are in `ops.event_image`.
+and may be memory-mapped, see `storage.event_cache`; images of it are in `events.image`.
 """
 
 from dataclasses import dataclass

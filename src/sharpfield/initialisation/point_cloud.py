@@ -15,7 +15,7 @@ from sharpfield.events.threshold import FixedThresholds
 from sharpfield.initialisation.fused_points import fuse_points
 from sharpfield.initialisation.posed_images import sharp_images
 from sharpfield.initialisation.start_points import starting_points
-from sharpfield.storage.result_cache import kept
+from sharpfield.storage.disk_cache import cached_arrays
 
 PAIRS = 1 << 20
 """Of points and cameras, looked at at once: few enough to stay close to the CPU."""
@@ -77,7 +77,7 @@ def starting_cloud(
     *,
     weight: Float[np.ndarray, "a"] | None = None,
 ) -> Cloud:
-    """Points on the surfaces of a capture; those of a long one are kept, see `captures.kept`.
+    """Points on the surfaces of a capture; those of a long one are cached on disk.
 
     Args:
         options: How many, and from where.
@@ -87,7 +87,7 @@ def starting_cloud(
     """
     weights = None if weight is None else weight.tolist()
     about = {"options": asdict(options), "seed": seed, "weight": weights}
-    found = kept(capture, "points", about, lambda: _found(options, capture, seed, weight))
+    found = cached_arrays(capture, "points", about, lambda: _found(options, capture, seed, weight))
     return Cloud(found["positions"], found["colours"], found["directions"], float(found["spacing"]))
 
 

@@ -28,7 +28,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Frames
 from sharpfield.metrics.blur_from_events import event_blur
 from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
-from sharpfield.storage.result_cache import kept
+from sharpfield.storage.disk_cache import cached_arrays
 
 WIDTH = 640
 """Images are compared at this width, in px."""
@@ -167,9 +167,11 @@ def frame_weights(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
     by_events = capture.events is not None and capture.events.track is None
     if judge == "events" or (judge == "auto" and by_events):
         return quality_weights(capture, source="events")
-    return kept(capture, "quality", {"judge": judge}, lambda: {"weights": _seen(capture, judge)})[
-        "weights"
-    ]
+    parameters = {"judge": judge}
+    found = cached_arrays(
+        capture, "quality", parameters, lambda: {"weights": _seen(capture, judge)}
+    )
+    return found["weights"]
 
 
 def _seen(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:

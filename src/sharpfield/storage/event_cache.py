@@ -1,33 +1,36 @@
-"""Streams larger than memory: unpacked once beside the capture, memory-mapped ever after.
+"""Event streams and their per-pixel index, memory-mapped from the disk cache if they are large.
 
 An `EventStream` needs plain arrays, and a compressed file has none. So the events of a large file
-are unpacked, a chunk at a time, to one `.npy` per column in a cache folder, and the stream's arrays
-are maps of these. Small files are simply loaded. The index by pixel (`ops.event_index`) of a
-mapped stream is kept in the same folder. All of it is derived: delete the folder when you like.
+are decompressed, a chunk at a time, to one `.npy` per column in the disk cache, and the arrays of
+the stream map these files. Small files are loaded. The per-pixel index (`events.index`) of a mapped
+stream lies in the same folder.
 """
 
-import hashlib
 import json
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int64
 
 from sharpfield.core.events import EventStream
-from sharpfield.core.files import replacing_folder
-from sharpfield.events.index import EventIndex, build
-from sharpfield.events.index_files import file_key, index_on_disk
+from sharpfield.events.index import EventIndex, build, count, place
+from sharpfield.events.sites import find_sites
+from sharpfield.storage.disk_cache import cache_folder, cache_key, cached
 from sharpfield.storage.event_file import EventFile
 
 IN_MEMORY = 50_000_000
-"""Up to this many events (0.7 GB) are loaded, more are mapped."""
+"""Up to this number of events (0.7 GB) are loaded, more are memory-mapped."""
+
+SORTED_AT_ONCE = 2**26
+"""Events that are sorted in memory at a time when an index is written: 9 bytes each."""
 
 COLUMNS = ("x", "y", "t_us", "p", "track")
-"""Of a stream; `track` only where there are several cameras."""
+"""Columns of a stream; `track` only where there are several cameras."""
+
 ABOUT = "events.json"
-"""Says what a cache was made from; written last."""
+"""Marks the folder of a stream, and says what it was made from."""
 
 
 def read_events(
@@ -37,36 +40,71 @@ def read_events(
 
     Args:
         file: An open file of events.
-        between: First and last time (us, both included) of the events to keep; by default all.
-        in_memory: How many events may be loaded.
+        between: First and last time (us, both included) of the events; by default all.
+        in_memory: Maximum number of events that are loaded.
 
     Raises:
         CaptureError: The events are unsound, see `core.events.checked`.
     """
-    if len(file) > in_memory:
-        return _mapped(file, between)
+    folder = _mapped_columns(file, between) if len(file) > in_memory else None
+    if folder is not None:
+        empty = file.part(0, 0)
+        columns = {name: _mapped(folder / f"{name}.npy") for name in _columns(empty)}
+        return replace(empty, **columns)
     stream = _filled(file, 0, len(file), lambda name, kind: np.empty(len(file), kind))
     return stream if between is None else stream.window(between[0], between[1] + 1)
 
 
 def event_index(events: EventStream) -> EventIndex:
-    """The index by pixel of a stream: built in memory, or kept beside the files it maps."""
-    folder = _mapped_folder(events)
+    """The per-pixel index of a stream: built in memory, or mapped if the stream is mapped."""
+    folder = _folder_of(events)
     if folder is None:
         return build(events)
-    return index_on_disk(events, folder / "index", key=file_key(folder / "t_us.npy"))
+    key = cache_key([folder / "t_us.npy"])
+    entry = cached(folder, "index", key, lambda path: write_index(events, path))
+    return build(events) if entry is None else open_index(entry, events.tracks)
 
 
-def cache_folder(path: Path) -> Path:
-    """Where to keep what is derived from a file.
+def write_index(events: EventStream, folder: Path, *, at_once: int = SORTED_AT_ONCE) -> None:
+    """Write the index of a stream, an `.npy` for each of its arrays.
 
-    It is `cache/` beside the file, or a folder of the user's own cache if that cannot be written.
+    Args:
+        events: The stream; its arrays may be memory-mapped.
+        folder: An existing folder.
+        at_once: Maximum number of events in memory while sorting; a single pixel may have more.
+
+    Raises:
+        CaptureError: See `events.index.build`.
     """
-    beside = path.resolve().parent
-    if os.access(beside, os.W_OK):
-        return beside / "cache"
-    digest = hashlib.blake2b(str(beside).encode(), digest_size=8).hexdigest()
-    return Path.home() / ".cache" / "sharpfield" / digest
+    site_xy, site_of = find_sites(events)
+    offset = count(events, site_of, len(site_xy))
+    np.save(folder / "site_xy.npy", site_xy)
+    np.save(folder / "offset.npy", offset)
+    t_us = _created(folder / "t_us.npy", np.dtype(np.int64), len(events))
+    p = _created(folder / "p.npy", np.dtype(np.int8), len(events))
+    for first, last in site_ranges(offset, at_once):
+        part = slice(offset[first], offset[last])
+        t_us[part], p[part] = place(events, site_of, offset, first=first, last=last)
+    t_us.flush()
+    p.flush()
+
+
+def open_index(folder: Path, tracks: int) -> EventIndex:
+    """The memory-mapped index that `write_index` wrote, of a stream of so many cameras."""
+    arrays = [_mapped(folder / f"{name}.npy") for name in ("site_xy", "offset", "t_us", "p")]
+    return EventIndex(*(np.asarray(array) for array in arrays), tracks=tracks)
+
+
+def site_ranges(offset: Int64[np.ndarray, "o"], most: int) -> list[tuple[int, int]]:
+    """Consecutive ranges of sites with at most `most` events each, or with a single site."""
+    ranges: list[tuple[int, int]] = []
+    first, sites = 0, len(offset) - 1
+    while first < sites:
+        last = int(np.searchsorted(offset, int(offset[first]) + most, side="right")) - 1
+        last = min(max(last, first + 1), sites)
+        ranges.append((first, last))
+        first = last
+    return ranges
 
 
 def _filled(
@@ -83,44 +121,43 @@ def _filled(
     return replace(stream, **columns)
 
 
-def _mapped(file: EventFile, between: tuple[int, int] | None) -> EventStream:
-    folder = cache_folder(file.path) / file.path.stem
-    about = {"source": file_key(file.path), "unit": file.unit, "between": between}
-    about = json.loads(json.dumps(about))  # tuples become lists, as they will when read
-    if _about(folder) != about:
+def _mapped_columns(file: EventFile, between: tuple[int, int] | None) -> Path | None:
+    """The folder of the columns of a file in the disk cache; None if it cannot be written."""
+
+    def write(folder: Path) -> None:
         first, last = 0, len(file)
         if between is not None:
             file.check()  # a search needs ascending times
             first, last = file.first_at(between[0]), file.first_at(between[1] + 1)
-        with replacing_folder(folder) as fresh:
 
-            def make(name: str, kind: np.dtype) -> np.ndarray:
-                path = fresh / f"{name}.npy"
-                return np.lib.format.open_memmap(path, "w+", kind, (last - first,))
+        def make(name: str, kind: np.dtype) -> np.ndarray:
+            return _created(folder / f"{name}.npy", kind, last - first)
 
-            _filled(file, first, last, make)
-            (fresh / ABOUT).write_text(json.dumps(about) + "\n")
-    none = file.part(0, 0)
-    columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in _columns(none)}
-    return replace(none, **columns)
+        _filled(file, first, last, make)
+        about = {"source": file.path.name, "unit": file.unit, "between": between}
+        (folder / ABOUT).write_text(json.dumps(about) + "\n")
+
+    key = cache_key([file.path], file.unit, between)
+    return cached(cache_folder(file.path), file.path.stem, key, write, replaces=True)
 
 
 def _columns(stream: EventStream) -> list[str]:
     return [name for name in COLUMNS if getattr(stream, name) is not None]
 
 
-def _about(folder: Path) -> object:
-    try:
-        return json.loads((folder / ABOUT).read_text())
-    except (OSError, json.JSONDecodeError):
-        return None
-
-
-def _mapped_folder(events: EventStream) -> Path | None:
+def _folder_of(events: EventStream) -> Path | None:
     """The cache folder whose files a stream maps, if it maps all of them from end to end."""
     times = events.t_us
     if not isinstance(times, np.memmap) or times.filename is None:
         return None
     folder = Path(times.filename).parent
-    whole = (folder / ABOUT).is_file() and len(np.load(times.filename, mmap_mode="r")) == len(times)
+    whole = (folder / ABOUT).is_file() and len(_mapped(folder / "t_us.npy")) == len(times)
     return folder if whole else None
+
+
+def _created(path: Path, kind: np.dtype, length: int) -> np.memmap:
+    return np.lib.format.open_memmap(path, "w+", kind, (length,))
+
+
+def _mapped(path: Path) -> np.ndarray:
+    return np.load(path, mmap_mode="r", allow_pickle=False)

@@ -1,15 +1,19 @@
 """Reading and writing still images, exactly as stored.
 
+Many images of one size are one array. Where they come from files and are large together, they are
+decoded once, in parallel, into the disk cache and memory-mapped from there: a training step needs a
+few frames of thousands, and decoding them again each time would cost more than the step.
+
 Values come back as the file holds them: 8 or 16 bit, RGB or grey, no PNG gamma applied, not turned
 by EXIF (poses and intrinsics refer to the stored orientation). What the numbers mean in terms of
 light is for `Frames.encoding` to say.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +21,7 @@ from jaxtyping import Shaped, UInt8, UInt16
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import replacing
+from sharpfield.storage.disk_cache import cache_folder, cache_key, cached
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -25,6 +30,12 @@ Alpha = Literal["drop", "white"]
 
 Image = UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"]
 Images = UInt8[np.ndarray, "n h w c"] | UInt16[np.ndarray, "n h w c"]
+Pixels = Shaped[np.ndarray, "..."]
+Stack = Shaped[np.ndarray, "n ..."]
+Item = TypeVar("Item")
+
+IN_MEMORY = 256_000_000
+"""Up to this number of bytes images are held in memory, larger stacks are memory-mapped."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -70,30 +81,72 @@ def read_image(path: Path, *, alpha: Alpha = "drop") -> Image:
 
 
 def read_images(paths: Sequence[Path], *, alpha: Alpha = "drop") -> Images:
-    """Images of one size and type, decoded in parallel.
+    """Images of one size and type, decoded in parallel and held in memory.
 
     Raises:
         CaptureError: There are none, one cannot be read, or they differ in size or type.
     """
-    if not paths:
-        raise CaptureError("there are no images to read")
-    first = read_image(paths[0], alpha=alpha)
-    images = np.empty((len(paths), *first.shape), first.dtype)
+    return image_stack(paths, lambda path: read_image(path, alpha=alpha))
 
-    def place(i: int) -> None:
-        image = read_image(paths[i], alpha=alpha) if i else first
+
+def image_stack(
+    items: Sequence[Item],
+    decode: Callable[[Item], Pixels],
+    *,
+    sources: Sequence[Path] = (),
+    kind: str = "",
+    in_memory: int = IN_MEMORY,
+) -> Stack:
+    """Images of one size and type as one array; memory-mapped, read only, if they are large.
+
+    Args:
+        items: What identifies each image to `decode`, such as its path.
+        decode: Returns the pixels of an image.
+        sources: Files that the images come from, whose cache they go to; without files all images
+            are held in memory.
+        kind: What the images are and how they were decoded, e.g. "colour 640x480": part of the key.
+        in_memory: Maximum number of bytes that are held in memory.
+
+    Raises:
+        CaptureError: There are none, one cannot be read, or they differ in shape or type.
+    """
+    if not items:
+        raise CaptureError("there are no images to read")
+    first = decode(items[0])
+    shape = (len(items), *first.shape)
+    if sources and first.nbytes * len(items) > in_memory:
+
+        def write(path: Path) -> None:
+            images = np.lib.format.open_memmap(path, "w+", first.dtype, shape)
+            _fill(images, items, decode, first)
+            images.flush()
+
+        key = cache_key(sources, kind, len(items))
+        entry = cached(cache_folder(sources[0].parent), "images", key, write, suffix=".npy")
+        if entry is not None:
+            return np.load(entry, mmap_mode="r")
+    images = np.empty(shape, first.dtype)
+    _fill(images, items, decode, first)
+    return images
+
+
+def _fill(
+    images: Stack, items: Sequence[Item], decode: Callable[[Item], Pixels], first: Pixels
+) -> None:
+    def decode_into(i: int) -> None:
+        image = decode(items[i]) if i else first
         if image.shape != first.shape or image.dtype != first.dtype:
             raise CaptureError(
                 "images differ in size or type",
-                where=f"{paths[0]} and {paths[i]}",
+                where=f"{items[0]} and {items[i]}",
                 got=f"{describe(first)} and {describe(image)}",
                 do="a capture has one camera: bring all images to one size, bit depth and colour",
             )
         images[i] = image
 
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
-        list(pool.map(place, range(len(paths))))
-    return images
+        for _ in pool.map(decode_into, range(len(items))):
+            pass
 
 
 def write_image(path: Path, image: Image) -> None:
@@ -109,9 +162,9 @@ def write_image(path: Path, image: Image) -> None:
         temporary.write_bytes(data.tobytes())
 
 
-def describe(image: Image) -> str:
+def describe(image: Pixels) -> str:
     """Size and type in words, e.g. `600x400 RGB 8 bit`."""
-    height, width, channels = image.shape
+    height, width, channels = image.shape if image.ndim == 3 else (*image.shape, 1)
     colour = {1: "grey", 3: "RGB", 4: "RGBA"}.get(channels, f"{channels} channels")
     return f"{width}x{height} {colour} {8 * image.dtype.itemsize} bit"
 

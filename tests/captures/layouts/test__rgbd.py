@@ -16,8 +16,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import DepthMaps
-from sharpfield.storage.images import read_image, write_image
-from sharpfield.storage.mapped_images import mapped_images
+from sharpfield.storage.images import write_image
 from tests.streams import HEIGHT, WIDTH
 
 COUNT = 12
@@ -289,31 +288,3 @@ def test_arkitscenes_with_depth_at_half_the_rate(tmp_path, poses, colours, depth
     assert made.notes["without_depth"].startswith("6 of 12 frames have no depth: 1_100.000, 1_100.")
     assert not made.depth.stored[::2].any()
     np.testing.assert_array_equal(made.depth.stored[1::2, ::2, ::2], depths[1::2])
-
-
-def test_many_images_are_mapped_and_found_again(tmp_path):
-    draw = np.random.default_rng(2)
-    images = draw.integers(0, 256, (5, 10, 12, 3)).astype(np.uint8)
-    paths = [tmp_path / "color" / f"{i}.png" for i in range(5)]
-    for path, image in zip(paths, images, strict=True):
-        write_image(path, image)
-    calls = []
-
-    def decode(path):
-        calls.append(path)
-        return read_image(path)
-
-    first = mapped_images(paths, decode, kind="colour", in_memory=100)
-    assert isinstance(first, np.memmap) and not first.flags.writeable
-    np.testing.assert_array_equal(first, images)
-    again = mapped_images(paths, decode, kind="colour", in_memory=100)
-    np.testing.assert_array_equal(again, images)
-    assert len(calls) == 6, "the second time only the first, to know the size"
-    write_image(paths[4], images[0])
-    changed = mapped_images(paths, decode, kind="colour", in_memory=100)
-    np.testing.assert_array_equal(changed[4], images[0])
-    loaded = mapped_images(paths[:2], decode, kind="colour")
-    assert not isinstance(loaded, np.memmap)
-    write_image(paths[1], images[1, :4])
-    with pytest.raises(CaptureError, match="images differ in size or type"):
-        mapped_images(paths, decode, kind="colour")

@@ -18,7 +18,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import MILLIMETRE, DepthMaps
-from sharpfield.storage.mapped_images import mapped
+from sharpfield.storage.images import image_stack
 
 BOUNDS = (0.1, 8.0)
 """Nearest and farthest depth of rooms, in metres."""
@@ -86,7 +86,7 @@ def rgbd_capture(
     if not len(kept):
         raise CaptureError("no frame has a usable pose", where=folder, got=f"{len(usable)} frames")
     camera = resized(frames.camera, SIZE)
-    images = mapped(
+    images = image_stack(
         kept.tolist(),
         lambda row: _sized(frames.colour(row), camera.size),
         sources=frames.sources,
@@ -199,7 +199,7 @@ def _depth_maps(
     frames: RgbdFrames, decode: Callable[[Row], UInt16[np.ndarray, "y x"]], rows: list[Row]
 ) -> UInt16[np.ndarray, "m y x"]:
     unknown = np.zeros(frames.depth_camera.size[::-1], np.uint16)
-    return mapped(
+    return image_stack(
         rows,
         lambda row: decode(row) if frames.measured[row] else unknown,
         sources=frames.depth_sources,

@@ -35,8 +35,7 @@ from sharpfield.captures.native.frames import decode_depth
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.storage.images import SUFFIXES, read_image
-from sharpfield.storage.mapped_images import mapped
+from sharpfield.storage.images import SUFFIXES, image_stack, read_image
 from sharpfield.storage.ply import columns, read_ply
 
 PUBLISHED_SPLIT = "train:5"
@@ -151,7 +150,7 @@ def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> 
     known = np.array([path.is_file() for path in paths])
     if known.any():
         unknown = np.zeros(frames.images.shape[1:], np.uint8)
-        truth = mapped(
+        truth = image_stack(
             paths,
             lambda path: rgb(path) if path.is_file() else unknown,
             sources=[path for path in paths if path.is_file()],

@@ -24,8 +24,7 @@ from sharpfield.core.capture import Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import DepthMaps, Exposure, Frames
 from sharpfield.storage.arrays import load_array
-from sharpfield.storage.images import describe, read_image, write_image
-from sharpfield.storage.mapped_images import mapped, mapped_images
+from sharpfield.storage.images import describe, image_stack, read_image, write_image
 from sharpfield.storage.toml_tables import Table
 
 DEPTH = "depth"
@@ -47,7 +46,7 @@ def read_depth(about: Table, files: Sequence[str], folder: Path) -> DepthMaps:
     about.expect_only("unit", "camera")
     paths = [folder / DEPTH / file for file in files]
     return DepthMaps(
-        mapped_images(paths, decode_depth, kind="depth"),
+        image_stack(paths, decode_depth, sources=paths, kind="depth"),
         read_camera(about.table("camera")),
         about.number("unit"),
     )
@@ -130,7 +129,8 @@ def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
         table.expect_only(*KEYS)
     names = tuple(table.text("name") for table in tables)
     files = [_inside(table, folder) for table in tables]
-    images = mapped_images([folder / FRAMES / file for file in files], read_image, kind="frames")
+    paths = [folder / FRAMES / file for file in files]
+    images = image_stack(paths, read_image, sources=paths, kind="frames")
     truth, known = _read_truth(tables, [folder / TRUTH / file for file in files], images)
     frames = Frames(
         images=images,
@@ -165,7 +165,7 @@ def _read_truth(
     first = read_image(there[0])
     _expect_like(first[None], images, paths[0].parent)
     unknown = np.zeros_like(first)
-    truth = mapped(
+    truth = image_stack(
         list(zip(paths, known.tolist(), strict=True)),
         lambda item: read_image(item[0]) if item[1] else unknown,
         sources=there,
