@@ -6,13 +6,19 @@ import torch
 
 from sharpfield.report.event_frames import count_events
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.twin.twin import EventTwin, Pace, light_of, on_path, on_track
+from sharpfield.twin.event_twin import (
+    EventTwin,
+    TimeSteps,
+    light_of,
+    path_viewpoint,
+    track_viewpoint,
+)
 from tests.recipes.moving import tiny_moving
 from tests.recipes.test_evdnerf_physical import SMALL, learned
 
 SENSOR = EventSensor(threshold_on=0.02, threshold_off=0.02)
 SPAN = (0, 100_000)
-PACE = Pace(step_us=10_000, most_change=1e9)
+TIME_STEPS = TimeSteps(step_us=10_000, most_change=1e9)
 BACK = np.diag([-1.0, 1.0, -1.0])
 """Turns a camera round."""
 
@@ -30,8 +36,8 @@ def pose_of(track: int) -> np.ndarray:
 def twin(model, *poses: np.ndarray) -> EventTwin:
     """Of a camera that goes from pose to pose."""
     times = np.linspace(*SPAN, len(poses)).astype(np.int64)
-    seat = on_path(model, times, np.stack(poses))
-    return EventTwin(light_of(model, seat), SPAN, SENSOR, pace=PACE)
+    seat = path_viewpoint(model, times, np.stack(poses))
+    return EventTwin(light_of(model, seat), SPAN, SENSOR, time_steps=TIME_STEPS)
 
 
 def test_far_outside_the_rig_light_is_sound_and_what_misses_the_scene_is_silent(model):
@@ -39,7 +45,7 @@ def test_far_outside_the_rig_light_is_sound_and_what_misses_the_scene_is_silent(
     near = pose_of(0)
     far = near.copy()
     far[:, 3] -= 40 * near[:, 2]  # the scene is less than a pixel wide
-    seat = on_path(model, np.array(SPAN), np.stack([far, far]))
+    seat = path_viewpoint(model, np.array(SPAN), np.stack([far, far]))
     views = [light_of(model, seat)(t) for t in SPAN]
     middle = (slice(6, 10), slice(6, 10))
     for view in views:
@@ -74,10 +80,10 @@ def test_a_still_scene_makes_no_events_for_a_still_camera_and_some_for_a_moving_
 
 
 def test_windows_of_a_held_out_camera_add_up(model):
-    seat = on_track(model, tiny_moving(), 3)
+    seat = track_viewpoint(model, tiny_moving(), 3)
 
     def made() -> EventTwin:
-        return EventTwin(light_of(model, seat), SPAN, SENSOR, pace=PACE)
+        return EventTwin(light_of(model, seat), SPAN, SENSOR, time_steps=TIME_STEPS)
 
     whole, cut = made().until(SPAN[1]), made()
     parts = [cut.until(t) for t in (33_333, 33_334, 70_001, SPAN[1])]

@@ -13,12 +13,12 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.geometry.trajectory import Still
 from sharpfield.simulation.sensors.event_pixels import EventSensor
-from sharpfield.twin.match import Matching, match
-from sharpfield.twin.twin import EventTwin, light_of, on_track, recorded_sensor
+from sharpfield.twin.event_twin import EventTwin, light_of, stated_sensor, track_viewpoint
+from sharpfield.twin.match import MatchOptions, match_thresholds
 from tests.evaluation.fake import Sky
 
 CLOCK = Clock(0, 400_000)
-SMALL = Matching(windows=4, window_us=40_000, lead_us=20_000)
+SMALL = MatchOptions(windows=4, window_us=40_000, lead_us=20_000)
 
 
 class Waves(Sky):
@@ -43,7 +43,7 @@ def recorded(tracks: int = 1) -> Capture:
     still = Still(np.tile(np.eye(3, 4), (tracks, 1, 1)))
     blank = Capture(camera, still, CLOCK, 0.5, 2.0, events=empty)
     truth = Waves(blank, 1.5)
-    seat = on_track(truth, blank, 0)
+    seat = track_viewpoint(truth, blank, 0)
     sensor = EventSensor(threshold_on=0.25, threshold_off=0.2)
     seen = EventTwin(light_of(truth, seat), seat.span_us, sensor).until(400_001)
     known = Known(thresholds=Thresholds(0.2, 0.25))
@@ -52,7 +52,7 @@ def recorded(tracks: int = 1) -> Capture:
 
 def test_the_true_scene_needs_no_other_thresholds():
     own = recorded()
-    found = match(Waves(own, 1.5), own, matching=SMALL)
+    found = match_thresholds(Waves(own, 1.5), own, options=SMALL)
     assert found.on == pytest.approx(1, abs=0.02) and found.off == pytest.approx(1, abs=0.02)
     assert found.unmatched == pytest.approx(found.recorded, rel=0.02)
 
@@ -61,12 +61,12 @@ def test_a_softer_scene_is_matched_by_its_contrast_and_holds_elsewhere():
     own = recorded()
     soft = Waves(own, 0.9)
     span = (200_000, 300_000)
-    found = match(soft, own, matching=SMALL, away_from=span)
+    found = match_thresholds(soft, own, options=SMALL, away_from=span)
     assert found.on == pytest.approx(0.6, abs=0.03) and found.off == pytest.approx(0.6, abs=0.03)
     assert found.unmatched < 0.7 * found.recorded
-    sensor = found.of(recorded_sensor(own))
+    sensor = found.applied(stated_sensor(own))
     assert sensor.threshold_on == pytest.approx(0.15, abs=0.01)
-    twin = EventTwin(light_of(soft, on_track(soft, own, 0)), (0, 300_000), sensor)
+    twin = EventTwin(light_of(soft, track_viewpoint(soft, own, 0)), (0, 300_000), sensor)
     twin.until(span[0])
     held_out = own.events.window(*span)
     assert len(twin.until(span[1])) == pytest.approx(len(held_out), rel=0.03)
@@ -74,19 +74,21 @@ def test_a_softer_scene_is_matched_by_its_contrast_and_holds_elsewhere():
 
 def test_as_much_is_looked_at_whatever_time_is_left_out():
     own = recorded()
-    whole = match(Waves(own, 1.5), own, matching=SMALL).recorded
+    whole = match_thresholds(Waves(own, 1.5), own, options=SMALL).recorded
     for away in ((100_000, 300_000), (-5, 200_000), (80_000, 500_000)):
-        found = match(Waves(own, 1.5), own, matching=SMALL, away_from=away).recorded
+        found = match_thresholds(Waves(own, 1.5), own, options=SMALL, away_from=away).recorded
         assert found == pytest.approx(whole, rel=0.1)
-    with_nothing_after = match(Waves(own, 1.5), own, matching=SMALL, away_from=(60_000, 400_000))
+    with_nothing_after = match_thresholds(
+        Waves(own, 1.5), own, options=SMALL, away_from=(60_000, 400_000)
+    )
     assert with_nothing_after.recorded > 0, "just as long as a lead and its window"
 
 
 def test_every_camera_that_taught_has_its_windows():
     own = recorded(tracks=2)
     both = replace(own.events, track=(np.arange(len(own.events)) % 2).astype(np.uint8), tracks=2)
-    found = match(Waves(own, 1.5), replace(own, events=both), matching=SMALL)
-    whole = match(Waves(own, 1.5), own, matching=SMALL)
+    found = match_thresholds(Waves(own, 1.5), replace(own, events=both), options=SMALL)
+    whole = match_thresholds(Waves(own, 1.5), own, options=SMALL)
     assert found.recorded == pytest.approx(whole.recorded / 2, rel=0.05)  # each saw every other
     assert found.on > 1.3  # and so pixels of half the events take larger thresholds
 
@@ -94,13 +96,13 @@ def test_every_camera_that_taught_has_its_windows():
 def test_what_cannot_be_matched_is_refused():
     own = recorded()
     with pytest.raises(OptionError, match="no events to match"):
-        match(Waves(own, 1.5), replace(own, events=own.events[:0]), matching=SMALL)
+        match_thresholds(Waves(own, 1.5), replace(own, events=own.events[:0]), options=SMALL)
     with pytest.raises(OptionError, match="too far from the recorded"):
-        match(Waves(own, 0.01), own, matching=SMALL)
+        match_thresholds(Waves(own, 0.01), own, options=SMALL)
     with pytest.raises(OptionError, match="nothing of the recording is left"):
-        match(Waves(own, 1.5), own, matching=SMALL, away_from=(0, 400_000))
+        match_thresholds(Waves(own, 1.5), own, options=SMALL, away_from=(0, 400_000))
     early = replace(own, events=own.events[:5])
     with pytest.raises(OptionError, match="too little was recorded"):
-        match(Waves(own, 1.5), early, matching=SMALL)
-    with pytest.raises(OptionError, match="windows to match must be there"):
-        Matching(windows=0)
+        match_thresholds(Waves(own, 1.5), early, options=SMALL)
+    with pytest.raises(OptionError, match="at least one window"):
+        MatchOptions(windows=0)

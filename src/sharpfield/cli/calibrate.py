@@ -9,8 +9,8 @@ from sharpfield.captures.native import layout as native
 from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
 from sharpfield.core.capture import Thresholds
-from sharpfield.preparation.calibrate.calibrate import CalibrateOptions
-from sharpfield.preparation.calibrate.calibrate import calibrate as measure
+from sharpfield.preparation.calibrate.measure import CalibrateOptions
+from sharpfield.preparation.calibrate.measure import calibrate as measure
 from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
 
 MEASURING = CalibrateOptions()

@@ -13,7 +13,7 @@ from sharpfield.captures.read import read_capture
 from sharpfield.captures.summary import summary
 from sharpfield.cli.arguments import Size, parse_size, screen
 from sharpfield.core.capture import Capture
-from sharpfield.preparation.deblur import DeblurOptions, deblur_to
+from sharpfield.preparation.deblurring import DeblurOptions, deblur_to
 from sharpfield.runs.captures import LayoutName, write
 from sharpfield.simulation.by_name import (
     RECORDING,

@@ -12,7 +12,7 @@ from sharpfield.cli.arguments import Device, Size, parse_size, screen
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.evaluation.tables import methods_table
-from sharpfield.preparation.deblur import DeblurOptions, deblur
+from sharpfield.preparation.deblurring import DeblurOptions, deblur
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.report.tables import markdown
 from sharpfield.runs.config import RunConfig, device_named

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from sharpfield.cli.arguments import screen
 from sharpfield.core.files import write_json
-from sharpfield.preparation.doctor.doctor import examine_path
+from sharpfield.preparation.doctor.checkup import examine_path
 from sharpfield.preparation.doctor.findings import Checkup
 from sharpfield.preparation.doctor.page import verdict, write_doctor_page
 from sharpfield.storage.images import write_image

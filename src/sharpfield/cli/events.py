@@ -19,25 +19,25 @@ from sharpfield.runs.events import RECORDED, event_sensor, whole_steps
 from sharpfield.runs.run import Run, open_run
 from sharpfield.simulation.sensors.event_pixels import SIZES, EventSensor
 from sharpfield.storage.event_formats import expect_format
-from sharpfield.twin.match import match
-from sharpfield.twin.output import (
-    Tell,
-    Wanted,
-    compare,
-    expect_comparable,
-    recorded_by,
-    recorded_in,
-    telling,
-    write_parts,
-)
-from sharpfield.twin.twin import (
+from sharpfield.twin.event_twin import (
     EventTwin,
-    Pace,
+    TimeSteps,
     Viewpoint,
     light_of,
-    on_path,
-    on_track,
-    sized,
+    path_viewpoint,
+    resized_camera,
+    track_viewpoint,
+)
+from sharpfield.twin.match import match_thresholds
+from sharpfield.twin.output import (
+    EventOutputs,
+    TimeProgress,
+    events_of_file,
+    events_of_view,
+    expect_comparable,
+    render_progress,
+    write_comparison,
+    write_windows,
 )
 
 OWN_SIZE = "sensor"
@@ -90,9 +90,9 @@ class Pixels:
     most_change: float = 2.0
     """Largest change of any pixel between two images, in thresholds."""
 
-    def pace(self) -> Pace:
+    def time_steps(self) -> TimeSteps:
         """Steps of time."""
-        return Pace(us(self.step_ms), self.most_change, us(self.shortest_ms))
+        return TimeSteps(us(self.step_ms), self.most_change, us(self.shortest_ms))
 
 
 @dataclass(frozen=True)
@@ -150,18 +150,18 @@ def events(
     sensor = event_sensor(opened.capture, pixels.sensor, pixels.threshold)
     if pixels.match:
         sensor = _matched(console, opened, pixels, seat.span_us, sensor)
-    wanted = Wanted(
+    wanted = EventOutputs(
         out,
         None if extra.frames is None else out.with_name(f"{out.stem}-frames"),
         extra.least_share,
         keep=recorded is not None,
     )
-    with telling(console, span) as (look, tell):
+    with render_progress(console, span) as (look, tell):
         light = light_of(opened.model, seat, subpixels=pixels.subpixels, progress=look)
-        seen = whole_steps(span, whole.span_us[1], pixels.pace())
-        twin = EventTwin(light, seen, sensor, pace=pixels.pace(), seed=pixels.seed)
-        made = write_parts(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
-    say = f"{made.count:,} events, from {twin.looks} images, are in {out}"
+        seen = whole_steps(span, whole.span_us[1], pixels.time_steps())
+        twin = EventTwin(light, seen, sensor, time_steps=pixels.time_steps(), seed=pixels.seed)
+        made = write_windows(wanted, _parts(twin, seat.span_us[0], edges, tell), len(edges))
+    say = f"{made.count:,} events, from {twin.rendered} images, are in {out}"
     console.print(say)
     if wanted.frames is not None:
         console.print(f"{len(edges)} event frames are in {wanted.frames}")
@@ -172,10 +172,12 @@ def events(
             "matched": pixels.match,
         }
         streams = made.stream, recorded
-        compare(console, out, streams, [seat.span_us[0], *edges], about)
+        write_comparison(console, out, streams, [seat.span_us[0], *edges], about)
 
 
-def _parts(twin: EventTwin, start_us: int, edges: list[int], tell: Tell) -> Iterator[EventStream]:
+def _parts(
+    twin: EventTwin, start_us: int, edges: list[int], tell: TimeProgress
+) -> Iterator[EventStream]:
     """Nothing, once all before the start was seen in silence; then the events of each window."""
     before = twin.until(twin.span_us[0])
     for edge in windows(twin.span_us[0], start_us, us(PIECE_MS)):
@@ -190,12 +192,12 @@ def _parts(twin: EventTwin, start_us: int, edges: list[int], tell: Tell) -> Iter
 def _seat(opened: Run, place: Place, sensor: str) -> Viewpoint:
     """Where to look from, as long as the camera's path lasts."""
     if place.trajectory is not None:
-        seat = on_path(opened.model, *read_poses(place.trajectory))
+        seat = path_viewpoint(opened.model, *read_poses(place.trajectory))
     else:
-        seat = on_track(opened.model, opened.capture, place.view or 0)
+        seat = track_viewpoint(opened.model, opened.capture, place.view or 0)
     if place.size is None:
         return seat
-    return replace(seat, camera=sized(seat.camera, _size(place.size, sensor)))
+    return replace(seat, camera=resized_camera(seat.camera, _size(place.size, sensor)))
 
 
 def _ends(place: Place) -> tuple[int | None, int | None]:
@@ -224,14 +226,14 @@ def _matched(
     console: Console, opened: Run, pixels: Pixels, span: tuple[int, int], sensor: EventSensor
 ) -> EventSensor:
     """The sensor with thresholds that fit the scene; says what was found."""
-    found = match(
+    found = match_thresholds(
         opened.model,
         opened.capture,
         away_from=span,
         subpixels=pixels.subpixels,
-        pace=pixels.pace(),
+        time_steps=pixels.time_steps(),
     )
-    matched = found.of(sensor)
+    matched = found.applied(sensor)
     console.print(
         f"Thresholds x {found.on:.3f} to brighter, x {found.off:.3f} to darker match "
         f"{found.recorded:,} recorded events outside the time rendered; without, the scene makes "
@@ -257,9 +259,9 @@ def _recorded(
     if not extra.compares:
         return None
     if extra.against is not None:
-        recorded = recorded_in(extra.against, seat.span_us, place.view or 0)
+        recorded = events_of_file(extra.against, seat.span_us, place.view or 0)
     else:
-        recorded = recorded_by(capture, place.view or 0)
+        recorded = events_of_view(capture, place.view or 0)
     expect_comparable(recorded, seat)
     return recorded
 

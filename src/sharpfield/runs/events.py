@@ -11,16 +11,16 @@ from sharpfield.core.errors import OptionError, did_you_mean
 from sharpfield.core.events import EventStream
 from sharpfield.runs.views import as_pose
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
-from sharpfield.twin.twin import (
+from sharpfield.twin.event_twin import (
     EventTwin,
-    Pace,
+    TimeSteps,
     Viewpoint,
-    filter_of,
+    colour_filter_of,
     light_of,
-    on_path,
-    on_track,
-    recorded_sensor,
-    sized,
+    path_viewpoint,
+    resized_camera,
+    stated_sensor,
+    track_viewpoint,
 )
 
 RECORDED = "recorded"
@@ -45,19 +45,19 @@ def event_sensor(capture: Capture, name: str, threshold: float | None = None) ->
         do = did_you_mean(name, [RECORDED, *SENSORS])
         raise OptionError("unknown sensor", got=name, do=do)
     if name == RECORDED:
-        sensor = recorded_sensor(capture)
+        sensor = stated_sensor(capture)
     else:
-        sensor = replace(SENSORS[name], bayer=filter_of(capture))
+        sensor = replace(SENSORS[name], bayer=colour_filter_of(capture))
     if threshold is None:
         return sensor
     return replace(sensor, threshold_on=threshold, threshold_off=threshold)
 
 
-def whole_steps(span_us: tuple[int, int], last_us: int, pace: Pace) -> tuple[int, int]:
+def whole_steps(span_us: tuple[int, int], last_us: int, time_steps: TimeSteps) -> tuple[int, int]:
     """A span with all of its last step, so that where it is cut changes nothing before."""
     start, end = span_us
-    steps = -(-(end - start) // pace.step_us)
-    return start, min(start + steps * pace.step_us, last_us)
+    steps = -(-(end - start) // time_steps.step_us)
+    return start, min(start + steps * time_steps.step_us, last_us)
 
 
 def viewpoint(
@@ -65,13 +65,13 @@ def viewpoint(
 ) -> Viewpoint:
     """An event camera on a track of the capture, or on a path of its own."""
     if isinstance(path, int):
-        seen = on_track(model, capture, path)
+        seen = track_viewpoint(model, capture, path)
     else:
         times_us, poses = path
-        seen = on_path(
+        seen = path_viewpoint(
             model, np.asarray(times_us, np.int64), np.stack([as_pose(pose) for pose in poses])
         )
-    return seen if size is None else replace(seen, camera=sized(seen.camera, size))
+    return seen if size is None else replace(seen, camera=resized_camera(seen.camera, size))
 
 
 def render_events(
@@ -80,7 +80,7 @@ def render_events(
     sensor: EventSensor,
     span_us: tuple[float | int | None, float | int | None],
     *,
-    pace: Pace,
+    time_steps: TimeSteps,
     subpixels: int = 1,
     seed: int = 0,
 ) -> EventStream:
@@ -93,5 +93,7 @@ def render_events(
     start, end = (None if us is None else round(us) - first for us in span_us)
     part = seen.between(start, end)
     light = light_of(model, part, subpixels=subpixels)
-    twin = EventTwin(light, whole_steps(part.span_us, last, pace), sensor, pace=pace, seed=seed)
+    twin = EventTwin(
+        light, whole_steps(part.span_us, last, time_steps), sensor, time_steps=time_steps, seed=seed
+    )
     return twin.until(part.span_us[1])

@@ -34,7 +34,7 @@ from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, vie
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.record import Ledger, read_ledger
-from sharpfield.twin.twin import PACE, Pace
+from sharpfield.twin.event_twin import TIME_STEPS, TimeSteps
 
 
 @dataclass(frozen=True, repr=False)
@@ -123,7 +123,7 @@ class Run:
         end: float | int | None = None,
         size: tuple[int, int] | None = None,
         sensor: str | EventSensor = RECORDED,
-        pace: Pace = PACE,
+        time_steps: TimeSteps = TIME_STEPS,
         subpixels: int = 1,
         seed: int = 0,
     ) -> EventStream:
@@ -136,7 +136,7 @@ class Run:
             size: Width and height of the sensor in px; by default the capture's.
             sensor: "recorded" for ideal pixels with the thresholds that the capture states; ideal,
                 dvs346, gen3-vga, gen4-hd; or the numbers of one.
-            pace: How finely time is stepped.
+            time_steps: How finely time is stepped.
             subpixels: Along each side of a pixel, whose light is their mean.
             seed: Random seed of what differs from pixel to pixel, and of noise.
 
@@ -148,7 +148,13 @@ class Run:
             sensor = event_sensor(self.capture, sensor)
         camera = event_viewpoint(self.model, self.capture, path, size)
         return render_events(
-            self.model, camera, sensor, (start, end), pace=pace, subpixels=subpixels, seed=seed
+            self.model,
+            camera,
+            sensor,
+            (start, end),
+            time_steps=time_steps,
+            subpixels=subpixels,
+            seed=seed,
         )
 
     def export(

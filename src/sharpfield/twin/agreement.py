@@ -1,12 +1,12 @@
-"""How well the events of a twin agree with those that a real camera, or another, recorded.
+"""How well rendered events agree with recorded ones.
 
-    count       of all events, predicted over recorded
+    count       number of events, predicted over recorded
     pixel       numbers of events at each pixel in a window
-    sign        of the sum of signs at a pixel in a window: darker, brighter, or nothing
-    timing      from a recorded event to the nearest predicted one of its pixel and sign
+    sign        sign of the summed polarities at a pixel in a window: darker, brighter, or none
+    timing      time from a recorded event to the nearest predicted one of its pixel and polarity
 
-The PSNR of event frames has a fixed range in counts, unlike the published one, whose range is
-twice the largest count of the whole set: a prediction of no events at all looks good in it.
+The PSNR of event frames has a fixed peak in counts. The published one has a peak of twice the
+largest count of the whole set, which gives predicting no events at all a high score.
 """
 
 import math
@@ -24,66 +24,70 @@ from sharpfield.report.colormaps import colour_signs
 from sharpfield.report.event_frames import busy, count_events, signed
 
 MOST_COUNT = 20
-"""Larger counts of a pixel and window are cut to this before they are compared as images."""
+"""Counts of a pixel and window are clipped to this before they are compared as images."""
 
 GAP_PX = 4
-"""Between images side by side."""
+"""Gap between images side by side."""
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """Numbers of one comparison; NaN where nothing was there to compare."""
+class EventAgreement:
+    """Metrics of one comparison; NaN where there was nothing to compare."""
 
     predicted: int
-    """Events."""
+    """Number of events."""
     recorded: int
+    """Number of events."""
     count_ratio: float
     """Predicted over recorded."""
     pixel_correlation: float
-    """Of the number of events at each pixel over the whole time, both signs counted apart."""
+    """Of the event counts of each pixel and polarity over the whole time."""
     count_error: float
-    """Wrong counts in all windows as a share of all recorded events; 1 for predicting none."""
+    """Sum of absolute count errors over all windows, relative to all recorded events; 1 for
+    predicting none."""
     sign_iou: float
-    """Pixels and windows of the same sign over those where either says anything."""
+    """Pixels and windows of the same sign over those where either stream has events."""
     frame_psnr: float
     """Of signed event frames, in dB, with a range of plus and minus `MOST_COUNT` events."""
     empty_psnr: float
-    """The same for predicting no event at all."""
+    """`frame_psnr` of predicting no events at all."""
     timing_ms: float
-    """Median time from a recorded event to the nearest predicted one of its pixel and sign."""
+    """Median time from a recorded event to the nearest predicted one of its pixel and polarity."""
     timed_share: float
-    """Share of recorded events that have one."""
+    """Share of recorded events that have such a predicted event."""
 
 
-def agreement(predicted: EventStream, recorded: EventStream, edges_us: Sequence[int]) -> Agreement:
+def compare_events(
+    predicted: EventStream, recorded: EventStream, edges_us: Sequence[int]
+) -> EventAgreement:
     """Compare two streams.
 
     Args:
-        predicted: Of the twin.
-        recorded: Of the camera it stands for.
-        edges_us: Where windows begin and end; only what lies within counts.
+        predicted: Rendered events.
+        recorded: Events of the real camera.
+        edges_us: Boundaries of the windows; only events within them count.
 
     Raises:
         OptionError: The sensors differ in size, or nothing was recorded.
     """
-    mine, theirs = (s.window(edges_us[0], edges_us[-1]) for s in (predicted, recorded))
-    sizes = [(s.width, s.height) for s in (mine, theirs)]
+    predicted, recorded = (s.window(edges_us[0], edges_us[-1]) for s in (predicted, recorded))
+    sizes = [(s.width, s.height) for s in (predicted, recorded)]
     if sizes[0] != sizes[1]:
         raise OptionError("the two sensors differ in size", got=f"{sizes[0]} and {sizes[1]} px")
-    if not len(theirs):
+    if not len(recorded):
         raise OptionError("nothing was recorded in this time, by this camera")
-    counts = [_counts(stream, edges_us) for stream in (mine, theirs)]
-    total = [part.sum(0).ravel().astype(np.float64) for part in counts]
-    frames = [signed(part) for part in counts]
-    offset_us = _nearest_us(mine, theirs, edges_us[0])
+    counts = [_counts(stream, edges_us) for stream in (predicted, recorded)]
+    total = [part.sum(0).ravel().astype(np.float64) for part in counts]  # [h * w * 2]
+    frames = [signed(part) for part in counts]  # [n, h, w]
+    offset_us = _nearest_us(predicted, recorded, edges_us[0])
     found = offset_us >= 0
     either = (frames[0] != 0) | (frames[1] != 0)
     same = either & (np.sign(frames[0]) == np.sign(frames[1]))
     varied = all(part.std() > 0 for part in total)
-    return Agreement(
-        predicted=len(mine),
-        recorded=len(theirs),
-        count_ratio=len(mine) / len(theirs),
+    return EventAgreement(
+        predicted=len(predicted),
+        recorded=len(recorded),
+        count_ratio=len(predicted) / len(recorded),
         pixel_correlation=float(np.corrcoef(*total)[0, 1]) if varied else math.nan,
         count_error=float(
             relative_count_error(*(torch.from_numpy(part).float() for part in counts))
@@ -99,7 +103,7 @@ def agreement(predicted: EventStream, recorded: EventStream, edges_us: Sequence[
 def side_by_side(
     predicted: EventStream, recorded: EventStream, edges_us: Sequence[int]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The busiest window: what was recorded on the left, the twin on the right."""
+    """Event frames of the window with the most events: recorded left, predicted right."""
     starts = np.searchsorted(recorded.t_us, edges_us)
     chosen = int(np.argmax(np.diff(starts)))
     window = edges_us[chosen], edges_us[chosen + 1]
@@ -124,25 +128,28 @@ def _psnr(a: Int32[np.ndarray, "n h w"], b: Int32[np.ndarray, "n h w"]) -> float
 def _nearest_us(
     predicted: EventStream, recorded: EventStream, start_us: int
 ) -> Float[np.ndarray, "n"]:
-    """Time from each recorded event to the nearest predicted one of its kind; -1 without one."""
+    """Time from each recorded event to the nearest predicted one of its pixel and polarity.
+
+    -1 where there is none.
+    """
     if not len(predicted):
         return np.full(len(recorded), -1.0)
     span = 1 + max(int(predicted.t_us[-1]), int(recorded.t_us[-1])) - start_us
-    here, there = (_keys(stream, start_us, span) for stream in (predicted, recorded))
-    here.sort()
-    place = np.searchsorted(here, there)
-    nearest = np.full(len(there), np.inf)
-    for beside in (np.maximum(place - 1, 0), np.minimum(place, len(here) - 1)):
-        alike = here[beside] // span == there // span
-        away = np.abs(here[beside] - there).astype(np.float64)
-        nearest = np.minimum(nearest, np.where(alike, away, np.inf))
+    candidates, wanted = (_keys(stream, start_us, span) for stream in (predicted, recorded))
+    candidates.sort()
+    at = np.searchsorted(candidates, wanted)
+    nearest = np.full(len(wanted), np.inf)
+    for i in (np.maximum(at - 1, 0), np.minimum(at, len(candidates) - 1)):  # before, after
+        same = candidates[i] // span == wanted // span
+        apart = np.abs(candidates[i] - wanted).astype(np.float64)
+        nearest = np.minimum(nearest, np.where(same, apart, np.inf))
     return np.where(np.isfinite(nearest), nearest, -1.0)
 
 
 def _keys(events: EventStream, start_us: int, span: int) -> Int64[np.ndarray, "n"]:
-    """A number for each event that orders by pixel, then sign, then time."""
+    """A sort key of each event: pixel, then polarity, then time."""
     x, y = (
-        np.clip(np.floor(np.asarray(place, np.float64) + 0.5), 0, size - 1).astype(np.int64)
-        for place, size in ((events.x, events.width), (events.y, events.height))
+        np.clip(np.floor(np.asarray(position, np.float64) + 0.5), 0, size - 1).astype(np.int64)
+        for position, size in ((events.x, events.width), (events.y, events.height))
     )
     return ((y * events.width + x) * 2 + (events.p > 0)) * span + (events.t_us - start_us)

@@ -1,4 +1,4 @@
-"""What the `events` command writes and prints: streams as they come, frames, comparisons."""
+"""Output of rendered events: event files written window by window, event frames, comparisons."""
 
 import json
 import math
@@ -20,66 +20,72 @@ from sharpfield.recordings.open import open_events
 from sharpfield.report.event_frames import count_events, writing_frames
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
-from sharpfield.twin.agreement import agreement, side_by_side
-from sharpfield.twin.twin import Viewpoint
+from sharpfield.twin.agreement import compare_events, side_by_side
+from sharpfield.twin.event_twin import Viewpoint
 
-Look = Callable[[int, int], None]
-Tell = Callable[[int], None]
+ImageProgress = Callable[[int, int], None]
+"""Called with the pixels of an image that are rendered, and all."""
+TimeProgress = Callable[[int], None]
+"""Called with the time in us that is reached."""
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What is to be written of a stream."""
+class EventOutputs:
+    """What is written of an event stream."""
 
     out: Path
+    """Event file."""
     frames: Path | None = None
     """Folder of event frames."""
     least_share: float = 0.0
+    """Pixels with a smaller share of the largest count are left out of event frames."""
     keep: bool = False
-    """Whether all events are needed at the end."""
+    """Whether to return all events."""
 
 
 @dataclass(frozen=True)
-class Made:
-    """What was rendered, as far as it is still needed."""
+class WrittenEvents:
+    """Number of events written, and the events if they were kept."""
 
     count: int
-    """Events."""
+    """Number of events."""
     stream: EventStream
-    """All events, if they were to be kept."""
+    """All events if they were kept, else none."""
 
 
-def write_parts(wanted: Wanted, parts: Iterator[EventStream], number: int) -> Made:
-    """Write events of one window after the other as they come.
+def write_windows(
+    outputs: EventOutputs, parts: Iterator[EventStream], number: int
+) -> WrittenEvents:
+    """Write the events of one window after the other.
 
     Args:
-        wanted: Where.
-        parts: First an empty one, which says what the sensor is like; then one for each window.
-        number: Of windows.
+        outputs: Files to write.
+        parts: First an empty stream that describes the sensor, then one for each window.
+        number: Number of windows.
     """
     first = next(parts)
     kept, total = [first], 0
     with ExitStack() as open_files:
-        append = open_files.enter_context(exporting_events(wanted.out, first))
+        append = open_files.enter_context(exporting_events(outputs.out, first))
         count = None
-        if wanted.frames is not None:
-            frames = writing_frames(wanted.frames, number, least_share=wanted.least_share)
+        if outputs.frames is not None:
+            frames = writing_frames(outputs.frames, number, least_share=outputs.least_share)
             count = open_files.enter_context(frames)
         for part in parts:
             append(part)
             total += len(part)
             if count is not None:
                 count(count_events(part))
-            if wanted.keep:
+            if outputs.keep:
                 kept.append(part)
-    return Made(total, merged(kept))
+    return WrittenEvents(total, merged(kept))
 
 
-def recorded_by(capture: Capture, view: int) -> EventStream:
-    """What the camera of a view recorded, also if it was held out.
+def events_of_view(capture: Capture, view: int) -> EventStream:
+    """Recorded events of the camera of a view, also if it was held out.
 
     Raises:
-        OptionError: The capture has no events of it.
+        OptionError: The capture has no events of this view.
     """
     for stream in (capture.events, capture.test_events):
         if stream is not None and len(own := stream.of_track(view)):
@@ -89,11 +95,11 @@ def recorded_by(capture: Capture, view: int) -> EventStream:
     )
 
 
-def recorded_in(path: Path, span_us: tuple[int, int], view: int) -> EventStream:
-    """The events of any file in a stretch of time, both ends included; of a rig, those of a view.
+def events_of_file(path: Path, span_us: tuple[int, int], view: int) -> EventStream:
+    """Events of a file in a time span, both ends included; of a camera rig, those of a view.
 
     Raises:
-        CaptureError: The file is none, or has nothing then.
+        CaptureError: It is not an event file, or has no events in the time span.
     """
     found = []
     for part in open_events(path).chunks():
@@ -103,51 +109,51 @@ def recorded_in(path: Path, span_us: tuple[int, int], view: int) -> EventStream:
         found.append(own if own.track is None else own.of_track(view))
     if not sum(map(len, found)):
         raise CaptureError(
-            "nothing was recorded at the time that is rendered",
+            "the recording has no events in the time that is rendered",
             where=path,
             got=f"from {span_us[0]} to {span_us[1]} us, view {view}",
-            do="times of the file must be on the clock of the capture; of a rig, it has --view's",
+            do="times of the file must be on the clock of the capture; of a rig, --view is used",
         )
     return merged(found)
 
 
-def expect_comparable(recorded: EventStream, seat: Viewpoint) -> None:
-    """Refuse a recording that has other pixels than the twin, or nothing to say about its time.
+def expect_comparable(recorded: EventStream, view: Viewpoint) -> None:
+    """Check that a recording has the rendered pixels, and events in the rendered time.
 
     Raises:
-        OptionError: So it is.
+        OptionError: It has not.
     """
-    if (size := (recorded.width, recorded.height)) != seat.camera.size:
+    if (size := (recorded.width, recorded.height)) != view.camera.size:
         raise OptionError(
-            "the two sensors differ in size", got=f"{size} recorded, {seat.camera.size} rendered"
+            "the two sensors differ in size", got=f"{size} recorded, {view.camera.size} rendered"
         )
-    if not len(recorded.window(*seat.span_us)):
+    if not len(recorded.window(*view.span_us)):
         raise OptionError(
-            "nothing was recorded at the time that is rendered, by this camera",
-            got=f"from {seat.span_us[0]} to {seat.span_us[1]} us",
+            "this camera has no recorded events in the time that is rendered",
+            got=f"from {view.span_us[0]} to {view.span_us[1]} us",
             do="name another time with --from and --to",
         )
 
 
-def compare(
+def write_comparison(
     console: Console,
     out: Path,
     streams: tuple[EventStream, EventStream],
     edges_us: list[int],
     about: dict[str, Any],
 ) -> None:
-    """Print how two streams agree; write it, and a image of them, beside the events.
+    """Print the metrics of two streams; write them, and event frames of both, beside the events.
 
     Args:
         console: Where to print.
-        out: Of the events.
+        out: Event file.
         streams: Rendered, recorded.
-        edges_us: Where windows begin and end.
-        about: What else the file of numbers should say.
+        edges_us: Boundaries of the windows.
+        about: Further entries of the JSON file.
     """
     found = {
         name: value if math.isfinite(value) else None
-        for name, value in asdict(agreement(*streams, edges_us)).items()
+        for name, value in asdict(compare_events(*streams, edges_us)).items()
     }
     table, image = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
     with replacing(table) as temporary:
@@ -160,8 +166,10 @@ def compare(
 
 
 @contextmanager
-def telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, Tell]]:
-    """Progress through time, and within a image: what to tell of either."""
+def render_progress(
+    console: Console, span_us: tuple[int, int]
+) -> Iterator[tuple[ImageProgress, TimeProgress]]:
+    """A progress bar over time and within an image; gives a callback for each."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -172,10 +180,10 @@ def telling(console: Console, span_us: tuple[int, int]) -> Iterator[tuple[Look, 
     with progress_on(console, *columns) as progress:
         task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
 
-        def look(done: int, pixels: int) -> None:
+        def within_image(done: int, pixels: int) -> None:
             progress.update(task, description=f"image {done / pixels:4.0%}")
 
-        def tell(t_us: int) -> None:
+        def at_time(t_us: int) -> None:
             progress.update(task, completed=(t_us - span_us[0]) / 1000)
 
-        yield look, tell
+        yield within_image, at_time

@@ -15,7 +15,7 @@ from sharpfield.cli.doctor import doctor
 from sharpfield.core.capture import Capture, Known, Split
 from sharpfield.core.frames import Exposure
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.preparation.doctor.doctor import examine, examine_path
+from sharpfield.preparation.doctor.checkup import examine, examine_path
 from sharpfield.preparation.doctor.events import check_light, odd_pixels
 from sharpfield.preparation.doctor.findings import Checkup
 from sharpfield.preparation.poses.path import frames_of

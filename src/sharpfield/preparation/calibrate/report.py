@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing, write_json
-from sharpfield.preparation.calibrate.calibrate import Calibration
+from sharpfield.preparation.calibrate.measure import Calibration
 from sharpfield.preparation.thresholds import known_thresholds
 from sharpfield.storage.arrays import write_arrays
 from sharpfield.storage.images import write_image

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64, UInt8
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.metrics.image import gradient_energy
-from sharpfield.preparation.deblur import DeblurOptions, deblur
+from sharpfield.preparation.deblurring import DeblurOptions, deblur
 from sharpfield.preparation.thresholds import Found
 
 Source = Literal["auto", "edi", "frames", "sharpest"]

@@ -16,14 +16,14 @@ from sharpfield.geometry.normalise import moved, normalised
 from sharpfield.geometry.space import Similarity
 from sharpfield.geometry.trajectory import LearnedKnots, Stamped, Still
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
-from sharpfield.twin.twin import (
+from sharpfield.twin.event_twin import (
     EventTwin,
-    Pace,
+    TimeSteps,
     light_of,
-    on_path,
-    on_track,
-    recorded_sensor,
-    sized,
+    path_viewpoint,
+    resized_camera,
+    stated_sensor,
+    track_viewpoint,
 )
 from tests.evaluation.fake import CAMERA, Sky, capture
 
@@ -60,7 +60,7 @@ def sliding(metres: float = 0.5) -> Capture:
 
 def twin(made: Capture, sensor: EventSensor = SENSOR, **options: int) -> EventTwin:
     model = Wall(made)
-    seat = on_track(model, made, 0)
+    seat = track_viewpoint(model, made, 0)
     return EventTwin(light_of(model, seat), seat.span_us, sensor, **options)
 
 
@@ -112,7 +112,7 @@ def test_nothing_happens_before_a_camera_and_a_scene_that_stand_still():
     made = sliding(0.0)
     still = twin(made)
     assert len(all_of(still)) == 0
-    assert still.looks == 1 + 25  # steps of 4 ms, none of them halved
+    assert still.rendered == 1 + 25  # steps of 4 ms, none of them halved
 
 
 def test_a_scene_that_changes_is_seen_by_a_camera_that_stands_still():
@@ -122,7 +122,7 @@ def test_a_scene_that_changes_is_seen_by_a_camera_that_stands_still():
             return replace(seen, rgb=seen.rgb * (2 * rays.time[..., None]).exp())
 
     own = replace(sliding(), trajectory=Still(np.eye(3, 4)[None]))
-    seat = on_track(Dawn(own), own, 0)
+    seat = track_viewpoint(Dawn(own), own, 0)
     events = EventTwin(light_of(Dawn(own), seat), seat.span_us, SENSOR).until(99_000)
     assert len(events) == 30 * 7 and set(events.p) == {1}  # at 12.5, 25, ..., 87.5 ms
     np.testing.assert_allclose(events.t_us[::30], np.arange(1, 8) * 12_500, atol=5)
@@ -139,7 +139,7 @@ def test_going_back_darkens_what_going_forth_brightened():
 def test_reversed_time_flips_signs_and_keeps_times():
     """From a little above level 11 back to level 0, each level between is crossed again."""
     sensor = replace(SENSOR, threshold_on=0.25, threshold_off=0.25)
-    forward = light_of(Wall(sliding()), on_track(Wall(sliding()), sliding(), 0))
+    forward = light_of(Wall(sliding()), track_viewpoint(Wall(sliding()), sliding(), 0))
     end = 91_690  # level 11 is passed at 91_667
 
     def backward(t_us: int) -> np.ndarray:
@@ -155,7 +155,7 @@ def test_reversed_time_flips_signs_and_keeps_times():
 
 def test_counts_of_a_window_are_the_change_of_light_in_it():
     """The published event frame, but for what a pixel carries over: less than a threshold."""
-    draw = light_of(Wall(sliding()), on_track(Wall(sliding()), sliding(), 0))
+    draw = light_of(Wall(sliding()), track_viewpoint(Wall(sliding()), sliding(), 0))
     made = twin(sliding())
     made.until(23_000)
     part = made.until(61_000)
@@ -168,12 +168,12 @@ def test_counts_of_a_window_are_the_change_of_light_in_it():
 
 def test_a_pixel_gathers_light_over_its_area():
     """Of light exp(SLOPE x) over a pixel 1/40 wide, the mean is sinh(h)/h of the middle's."""
-    seat = on_track(Wall(sliding()), sliding(), 0)
+    seat = track_viewpoint(Wall(sliding()), sliding(), 0)
     whole = light_of(Wall(sliding()), seat, subpixels=16)(50_000)
     middle = light_of(Wall(sliding()), seat)(50_000)
     half = SLOPE / 40 / 2
     np.testing.assert_allclose(whole / middle, np.sinh(half) / half, rtol=1e-4)
-    with pytest.raises(OptionError, match="at least one part"):
+    with pytest.raises(OptionError, match="at least one subpixel"):
         light_of(Wall(sliding()), seat, subpixels=0)
 
 
@@ -190,7 +190,7 @@ def test_scenes_of_gaussians_are_drawn_as_large_as_their_subpixels_ask():
             light = torch.ones(1, height, width, 1)
             return Radiance(light[..., None].expand(1, height, width, 1, 3), light, light, light)
 
-    seat = on_track(Splats(sliding()), sliding(), 0)
+    seat = track_viewpoint(Splats(sliding()), sliding(), 0)
     for subpixels in (1, 3):
         assert light_of(Splats(sliding()), seat, subpixels=subpixels)(0).shape == (5, 6, 3)
     assert Splats.sizes == [(6, 5), (18, 15)]
@@ -199,17 +199,17 @@ def test_scenes_of_gaussians_are_drawn_as_large_as_their_subpixels_ask():
 def test_steps_are_halved_where_light_changes_much():
     """It changes by 0.03 a ms: 4 ms are less than 0.7 of 0.2, 2 ms than 0.5, 0.5 ms than 0.1."""
     looks = {
-        most: twin(sliding(), pace=Pace(most_change=most, shortest_us=1))
+        most: twin(sliding(), time_steps=TimeSteps(most_change=most, shortest_us=1))
         for most in (0.7, 0.5, 0.1)
     }
     for made in looks.values():
         all_of(made)
-    assert [made.looks for made in looks.values()] == [26, 51, 201]
+    assert [made.rendered for made in looks.values()] == [26, 51, 201]
 
 
 def test_events_come_only_from_within_the_span():
     model, made = Wall(sliding()), sliding()
-    seat = on_track(model, made, 0).between(20_000, 60_000)
+    seat = track_viewpoint(model, made, 0).between(20_000, 60_000)
     part = EventTwin(light_of(model, seat), seat.span_us, SENSOR).until(60_000)
     assert 20_000 <= part.t_us[0] and part.t_us[-1] < 60_000
     first = part.t_us[(part.x == 3) & (part.y == 2)][0]
@@ -223,19 +223,19 @@ def test_a_path_in_the_captures_world_is_brought_to_the_models():
     )
     there = moved(own, change)
     there = replace(there, trajectory=LearnedKnots(there.trajectory, knots=4))
-    given = on_path(Sky(there), own.trajectory.times_us, own.trajectory.poses)
-    seat = on_track(Sky(there), own, 0)
+    given = path_viewpoint(Sky(there), own.trajectory.times_us, own.trajectory.poses)
+    seat = track_viewpoint(Sky(there), own, 0)
     assert given.span_us == seat.span_us == (0, 1_000_000)
     a, b = (light_of(Sky(there), one)(430_000) for one in (given, seat))
     np.testing.assert_allclose(a, b, atol=1e-5)
-    astray = on_path(Sky(own), own.trajectory.times_us, own.trajectory.poses)
+    astray = path_viewpoint(Sky(own), own.trajectory.times_us, own.trajectory.poses)
     assert np.abs(light_of(Sky(there), astray)(430_000) - b).max() > 0.1
 
 
 def test_the_world_of_a_normalised_capture_is_found():
     own = sliding()
     there, _ = normalised(own)
-    seat = on_path(Wall(there), own.trajectory.times_us, own.trajectory.poses)
+    seat = path_viewpoint(Wall(there), own.trajectory.times_us, own.trajectory.poses)
     zero = torch.tensor(0)
     np.testing.assert_allclose(
         seat.path.pose(torch.tensor(0.3), zero), there.trajectory.pose(torch.tensor(0.3), zero)
@@ -244,7 +244,7 @@ def test_the_world_of_a_normalised_capture_is_found():
 
 def test_a_path_may_last_longer_than_the_capture():
     own = sliding()
-    seat = on_path(Wall(own), own.trajectory.times_us * 3, own.trajectory.poses)
+    seat = path_viewpoint(Wall(own), own.trajectory.times_us * 3, own.trajectory.poses)
     events = EventTwin(light_of(Wall(own), seat), seat.span_us, SENSOR).until(300_000)
     first = events.t_us[(events.x == 3) & (events.y == 2)][0]
     assert first == pytest.approx(25_000, abs=5)
@@ -272,11 +272,11 @@ def test_light_in_one_channel_is_grey():
 def test_the_sensor_of_a_capture_is_what_it_states():
     known = Known(thresholds=Thresholds(0.2, 0.31), refractory_us=50.0, log_floor=1e-3)
     own = replace(sliding(), known=known)
-    sensor = recorded_sensor(own)
+    sensor = stated_sensor(own)
     assert (sensor.threshold_on, sensor.threshold_off) == (0.31, EventSensor().threshold_off)
     assert (sensor.refractory_us, sensor.floor, sensor.bayer) == (50.0, 1e-3, "")
     coloured = replace(own, events=replace(no_events(), bayer="GRBG"))
-    assert recorded_sensor(coloured).bayer == "GRBG"
+    assert stated_sensor(coloured).bayer == "GRBG"
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -285,7 +285,7 @@ def test_every_sensor_reports(name: str):
 
 
 def test_other_pixels_see_the_same_middle():
-    large = sized(CAMERA, (80, 40))  # twice as large, and 24 rows less
+    large = resized_camera(CAMERA, (80, 40))  # twice as large, and 24 rows less
     assert (large.size, large.fx_px, large.cx_px, large.cy_px) == ((80, 40), 60.0, 40.0, 20.0)
     centre = torch.tensor([[20.0, 16.0]])
     np.testing.assert_allclose(
@@ -295,7 +295,7 @@ def test_other_pixels_see_the_same_middle():
 
 def test_times_outside_the_path_are_refused():
     own = sliding()
-    seat = on_track(Wall(own), own, 0)
+    seat = track_viewpoint(Wall(own), own, 0)
     for start, end in ((0, 100_001), (50_000, 50_000), (-1, None)):
         with pytest.raises(OptionError, match="use times from 0 to 100 ms"):
             seat.between(start, end)
@@ -304,8 +304,8 @@ def test_times_outside_the_path_are_refused():
 def test_a_view_that_is_not_there_is_refused():
     own = replace(sliding(), trajectory=Still(np.tile(np.eye(3, 4), (2, 1, 1))))
     with pytest.raises(OptionError, match="use a number from 0 to 1"):
-        on_track(Wall(own), own, 2)
-    assert on_track(Wall(own), own, 1).span_us == (0, 100_000)
+        track_viewpoint(Wall(own), own, 2)
+    assert track_viewpoint(Wall(own), own, 1).span_us == (0, 100_000)
 
 
 def test_a_model_that_has_come_apart_is_noticed():
@@ -314,8 +314,8 @@ def test_a_model_that_has_come_apart_is_noticed():
             return replace(super().render(rays), rgb=torch.full((*rays.time.shape, 3), torch.nan))
 
     own = sliding()
-    with pytest.raises(RunError, match="not a number"):
-        light_of(Broken(own), on_track(Broken(own), own, 0))(0)
+    with pytest.raises(RunError, match="not a finite number"):
+        light_of(Broken(own), track_viewpoint(Broken(own), own, 0))(0)
 
 
 def test_a_model_of_whole_views_without_lenses_keeps_its_own():
@@ -323,6 +323,6 @@ def test_a_model_of_whole_views_without_lenses_keeps_its_own():
         def draw_views(self, views: object) -> Radiance: ...
 
     own = sliding()
-    seat = on_track(Whole(own), own, 0)
+    seat = track_viewpoint(Whole(own), own, 0)
     with pytest.raises(OptionError, match="leave the size as it was recorded"):
-        light_of(Whole(own), replace(seat, camera=sized(own.camera, (12, 10))))
+        light_of(Whole(own), replace(seat, camera=resized_camera(own.camera, (12, 10))))

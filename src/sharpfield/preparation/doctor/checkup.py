@@ -13,7 +13,7 @@ from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError
-from sharpfield.preparation.calibrate.calibrate import CalibrateOptions, calibrate
+from sharpfield.preparation.calibrate.measure import CalibrateOptions, calibrate
 from sharpfield.preparation.doctor.agreement import check_agreement
 from sharpfield.preparation.doctor.events import check_layout, check_light, check_pixels, check_rate
 from sharpfield.preparation.doctor.findings import Checkup
