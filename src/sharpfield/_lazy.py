@@ -16,12 +16,16 @@ from collections.abc import Callable
 from typing import Any
 
 
-def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazily(
+    package: str, file: str, *, check_shapes: bool = False
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package.
 
     Args:
         package: Its name.
         file: Its `__init__.py`, whose imports under `if TYPE_CHECKING` are the names on offer.
+        check_shapes: Whether functions check the shapes of their arguments when called by these
+            names. Inside the project they are imported from where they are defined, unchecked.
     """
     with open(file, encoding="utf-8") as source:
         offered = offers(source.read())
@@ -33,6 +37,10 @@ def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], 
         if f"{module}.{member}" == f"{package}.{name}":
             return importlib.import_module(f"{module}.{member}")  # a module of the package itself
         found = getattr(importlib.import_module(module), member)
+        if check_shapes and callable(found) and not isinstance(found, type):
+            from sharpfield._shapes import with_shapes_checked  # not before it is needed
+
+            found = with_shapes_checked(found)
         setattr(importlib.import_module(package), name, found)
         return found
 

@@ -15,16 +15,18 @@ Sources: Pan et al., "Bringing a Blurry Frame Alive at High Frame-Rate with an E
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sharpfield.core.errors import OptionError, ShapeError
 from sharpfield.core.events import EventStream
 from sharpfield.core.tone import Tone
 from sharpfield.events.image import splat_bilinear
-from sharpfield.events.log_path import LogPath
+from sharpfield.events.log_path import LogPath, direct, follow
 from sharpfield.events.threshold import FixedThresholds
 
 STAMPS = 9
@@ -157,3 +159,43 @@ def joint_latents(
     for i in range(len(alone) - 2, -1, -1):
         found.append((reduced[i] + after[i] * found[-1]) / pivot[i])
     return torch.stack(found[::-1])
+
+
+def sharp_images(
+    blurred: Float[Tensor, "h w c"],
+    events: EventStream,
+    exposure_us: tuple[int, int],
+    *,
+    instants_us: Sequence[int] = (),
+    threshold: float | tuple[float, float] = 0.2,
+) -> Float[Tensor, "k h w c"]:
+    """The sharp images behind one blurred image and the events of its exposure.
+
+    Args:
+        blurred: Linear light, not stored values.
+        events: Of a mono sensor with the same pixels.
+        exposure_us: When the shutter opened and closed.
+        instants_us: When the images are sharp, ascending; by default the middle of the exposure.
+        threshold: Contrast threshold of both signs, or to darker and to brighter; natural log.
+
+    Raises:
+        ShapeError: Image and events have other sizes.
+        OptionError: The exposure is empty, or an instant is outside it.
+    """
+    if tuple(blurred.shape[:2]) != (events.height, events.width):
+        raise ShapeError(
+            "image and events have other sizes",
+            got=f"image {tuple(blurred.shape)}, events {events.height} rows of {events.width}",
+            do="crop or warp one to the other",
+        )
+    instants = np.asarray(instants_us or [sum(exposure_us) // 2], np.int64)
+    inside = (exposure_us[0] <= instants[0]) and (instants[-1] <= exposure_us[1])
+    if not (exposure_us[0] < exposure_us[1] and inside and (np.diff(instants) >= 0).all()):
+        raise OptionError(
+            "sharp images lie within the exposure, in the order of time",
+            got=f"exposure {exposure_us} us, instants {instants.tolist()} us",
+        )
+    both = (threshold, threshold) if isinstance(threshold, float | int) else threshold
+    spread = direct(width=events.width, height=events.height)
+    path = follow(events, exposure_us, instants, FixedThresholds(*both), spread)
+    return torch.stack([latent(blurred, path, k) for k in range(len(instants))])  # [k, h, w, c]

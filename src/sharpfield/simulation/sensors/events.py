@@ -5,7 +5,7 @@ after the other, so a recording of any length needs the memory of one gap betwee
 The result does not depend on how a straight piece of log intensity is cut into gaps.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from math import cos, log, sqrt
 from typing import NamedTuple, no_type_check
 
@@ -27,6 +27,8 @@ from sharpfield.simulation.sensors.event_pixels import (
 
 NEVER = np.iinfo(np.int64).min
 """`ready_ns` of a pixel that is not in its dead time."""
+IDEAL = EventSensor()
+
 LONGEST_COUNT_US = 1 << 20
 """Gaps longer than this are sorted by comparison; counting would need a table of this length."""
 
@@ -178,6 +180,33 @@ def joined(gaps: list[Gap], size: tuple[int, int], *, bayer: str = "") -> EventS
     """
     columns = [np.concatenate(column) for column in zip(*gaps, strict=True)]
     return EventStream(*columns, width=size[0], height=size[1], bayer=bayer)
+
+
+def events_of(
+    images: Float32[np.ndarray, "n h w 3"] | Float32[np.ndarray, "n h w"],
+    times_us: Sequence[int],
+    *,
+    sensor: EventSensor = IDEAL,
+    seed: int = 0,
+) -> EventStream:
+    """The events that a camera would report of images; log light is straight between two of them.
+
+    Args:
+        images: Linear light, not stored values.
+        times_us: When each was seen; ascending.
+        sensor: Its pixels.
+        seed: Random seed of what differs from pixel to pixel, and of noise.
+
+    Raises:
+        OptionError: There are not as many times as images, or they do not ascend.
+    """
+    if len(images) != len(times_us) or not len(images):
+        raise OptionError(
+            "there must be one time for each image", got=f"{len(images)} images, {len(times_us)}"
+        )
+    pixels = EventPixels(sensor, seed)
+    gaps = [pixels.see(one, 1000 * int(t)) for one, t in zip(images, times_us, strict=True)]
+    return joined(gaps, (images.shape[2], images.shape[1]), bayer=sensor.bayer)
 
 
 @njit(cache=True)
