@@ -23,7 +23,7 @@ from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 
 @dataclass(frozen=True)

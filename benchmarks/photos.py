@@ -22,7 +22,7 @@ from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 REFINED = Refinement(steps=200, rate=5e-4, every=50)
 

@@ -26,7 +26,7 @@ from sharpfield.runs.start import start
 from sharpfield.simulation.cameras.rigs import ring
 from sharpfield.simulation.moving_capture import MOVING_RIG, simulate_moving
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 Size = tuple[int, int]
 

@@ -30,7 +30,7 @@ from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 THRESHOLDS, GUESS = (0.23, 0.31), (0.25, 0.25)
 LATE_US = 2000

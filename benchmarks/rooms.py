@@ -26,7 +26,7 @@ from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.room_capture import ROOM_RIG, RoomTiming, simulate_room
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from sharpfield.simulation.by_name import (
     TimingOptions,
     simulate_named,
 )
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 __all__ = ["deblur", "open_recording", "open_run", "read", "simulate", "train", "write"]
 

@@ -119,7 +119,7 @@ def test_evaluate_can_refine_the_poses_first(trained: Path) -> None:
 
 
 def test_render_makes_a_video_and_images(trained: Path, tmp_path: Path) -> None:
-    assert run("render", trained, "--out", tmp_path / "video.mp4", "--images", 3) == 0
+    assert run("render", trained, "--out", tmp_path / "video.mp4", "--frames", 3) == 0
     assert (tmp_path / "video.mp4").stat().st_size > 0
     words = ("--path", "exposure:1", "--images", 2)
     assert run("render", trained, "--out", tmp_path / "inside", *words) == 0

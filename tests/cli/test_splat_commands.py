@@ -60,7 +60,7 @@ def test_render_draws_gaussians_along_every_path(
     kind: str, path: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     """Inside an exposure also where the model learned from events and never saw a frame."""
-    words = ("--out", tmp_path / "images", "--path", path, "--images", 2)
+    words = ("--out", tmp_path / "images", "--path", path, "--frames", 2)
     assert run("render", request.getfixturevalue(kind), *words) == 0
     assert len(list((tmp_path / "images").glob("*.png"))) == 2
 

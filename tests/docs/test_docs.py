@@ -82,7 +82,7 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Call]:
 def test_commands_are_understood(page: str, line: str, parse: Callable[[str], Call]) -> None:
     command, given = parse(line)
     if command == "train":
-        recipe, choice = given["recipe"], given.get("choice")
+        recipe, choice = given["recipe"], given.get("selection")
         made = recipe_named(recipe)()
         if choice is not None:
             presets = [preset for preset in choice.preset.split(",") if preset]

@@ -23,7 +23,7 @@ from sharpfield.storage.event_cache import event_index
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.session import train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet

@@ -25,7 +25,7 @@ from sharpfield.rendering.view import render_view
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.session import train
 from tests.recipes.box import box
 from tests.training.toy import quiet

@@ -2,7 +2,8 @@ import pytest
 import torch
 
 from sharpfield.core.errors import OptionError
-from sharpfield.training.plan import SLACK, Options, Plan, affordable_steps, make_plan
+from sharpfield.training.options import Options
+from sharpfield.training.plan import SLACK, Plan, affordable_steps, make_plan
 from tests.training.toy import Toy
 
 

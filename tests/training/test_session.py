@@ -14,7 +14,7 @@ from rich.console import Console
 
 from sharpfield.core.errors import RunError
 from sharpfield.training.checkpoint import file_of, load
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.record import Ledger, read_ledger
 from sharpfield.training.session import train
 from tests.training import toy

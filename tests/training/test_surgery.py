@@ -17,7 +17,7 @@ from sharpfield.training.checkpoint import (
 )
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.session import train
 from sharpfield.training.surgery import rebuild, resize
 from tests.training.growing import Blobs, GrowingToy

@@ -17,7 +17,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.session import train
 
 

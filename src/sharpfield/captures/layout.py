@@ -10,9 +10,10 @@ package adds one by an entry point in its `pyproject.toml`:
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from sharpfield.core.capture import Capture
+if TYPE_CHECKING:  # options are read without importing torch
+    from sharpfield.core.capture import Capture
 
 Missing = Literal["error", "skip"]
 """What to do about images that are listed but do not exist."""
@@ -63,7 +64,7 @@ class Layout:
     name: str
     recognise: Callable[[Path], bool]
     """Whether a folder has this layout, judged by its files without loading them."""
-    read: Callable[[Path, ReadOptions], Capture]
+    read: Callable[[Path, ReadOptions], "Capture"]
     """Reads a folder of this layout."""
     marks: str
     """The files by which it is recognised, in words."""

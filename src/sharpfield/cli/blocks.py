@@ -14,7 +14,7 @@ from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
-from sharpfield.cli.runs import OPTIONS, Choice
+from sharpfield.cli.train import TRAINING, Selection
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes.settings.options import changed, with_options
@@ -30,7 +30,7 @@ from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.record import Ledger, read_ledger, write_ledger
 
 FOLDER = "blocks"
@@ -38,23 +38,23 @@ FOLDER = "blocks"
 
 
 @dataclass(frozen=True)
-class Cut(Choice):
+class BlockSelection(Selection):
     """What of the recipe, and of the capture, is used, and in how many blocks."""
 
     count: int = 2
     """Blocks that the capture is cut into."""
 
 
-CUT = Cut()
+SELECTION = BlockSelection()
 
 
-def blocks(
+def blocks_command(
     recipe: Positional[str],
     capture: Positional[Path],
     out: Path,
     device: Device = "auto",
-    choice: Cut = CUT,
-    options: Options = OPTIONS,
+    selection: BlockSelection = SELECTION,
+    training: Options = TRAINING,
     reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
@@ -69,19 +69,19 @@ def blocks(
         capture: Folder of the capture.
         out: Folder of the merged run; the blocks' own runs are in it.
         device: Where to train.
-        choice: Presets, streams, single numbers, blocks.
-        options: How long, how often to save, how much memory; for each block.
+        selection: Presets, streams, blocks, seed.
+        training: How long, how often to save, how much memory; for each block.
         reading: How to read the capture, where its layout is wrong or silent.
         numbers: Options of the recipe by name, such as sampling.views.
     """
-    if choice.block:
-        raise OptionError("blocks are trained one and all", got=choice.block, do="use `train`")
-    hint_at_flags(recipe, choice.change)
-    console, where, count = screen(), device_named(device), choice.count
+    if selection.block:
+        raise OptionError("blocks are trained one and all", got=selection.block, do="use `train`")
+    hint_at_flags(recipe, selection.change)
+    console, where, count = screen(), device_named(device), selection.count
     source = read_capture(capture, reading)
-    made = prepared(recipe, choice.preset, capture=source, device=where)
-    made = with_options(changed(made, choice.change), numbers)
-    whole = RunConfig(recipe, made, str(capture.resolve()), choice.seed, choice.use, reading)
+    made = prepared(recipe, selection.preset, capture=source, device=where)
+    made = with_options(changed(made, selection.change), numbers)
+    whole = RunConfig(recipe, made, str(capture.resolve()), selection.seed, selection.use, reading)
     runs = [out / FOLDER / f"{i + 1}of{count}" for i in range(count)]
     started = [replace(whole, block=f"{i + 1}/{count}") for i in range(count)]
     for run, block in zip(runs, started, strict=True):
@@ -92,7 +92,7 @@ def blocks(
         if done is not None and done.finished:
             continue
         console.print(f"Block {block.block}")
-        going_on = replace(options, resume=options.resume or done is not None)
+        going_on = replace(training, resume=training.resume or done is not None)
         start(block, source, runs[i], going_on, device=where, console=console)
     ledgers = [ledger for run in runs if (ledger := read_ledger(run)) is not None]
     if len(ledgers) == count and all(ledger.finished for ledger in ledgers):

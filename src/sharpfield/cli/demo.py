@@ -20,7 +20,7 @@ from sharpfield.runs.run import open_run
 from sharpfield.runs.start import start
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 
 STRONG_BLUR = Timing(exposure_us=80_000, interval_us=90_000)
 """Exposures in dim light."""

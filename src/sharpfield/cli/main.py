@@ -7,8 +7,8 @@ import os
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
@@ -29,6 +29,8 @@ class Command:
     """One line for the list of commands."""
     recipe: bool = False
     """Whether the options of a recipe are options of the command."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Old names of options, accepted with a hint."""
 
 
 GROUPS: dict[str, dict[str, Command]] = {
@@ -48,12 +50,16 @@ GROUPS: dict[str, dict[str, Command]] = {
         "calibrate": Command("calibrate:calibrate", "measure contrast thresholds, find odd pixels"),
     },
     "learn": {
-        "train": Command("runs:train", "train a recipe on a capture", recipe=True),
-        "blocks": Command("blocks:blocks", "train a long capture in blocks", recipe=True),
+        "train": Command("train:train_command", "train a recipe on a capture", recipe=True),
+        "blocks": Command("blocks:blocks_command", "train a long capture in blocks", recipe=True),
     },
     "look": {
-        "evaluate": Command("runs:evaluate", "measure a run: metrics.json and report.html"),
-        "render": Command("runs:render", "render a video or images along a camera path"),
+        "evaluate": Command("evaluate:evaluate_command", "measure a run on held-out views"),
+        "render": Command(
+            "render:render_command",
+            "render a video or images along a camera path",
+            renamed={"images": "frames", "rate": "fps"},
+        ),
         "events": Command("events:events", "render the events a camera would report in a scene"),
         "export": Command("export:export", "write the Gaussians of a run as a .ply"),
     },
@@ -115,6 +121,7 @@ def _run(words: list[str]) -> None:
 
 def _call(name: str, words: list[str]) -> None:
     """Run a command with the options that are given in words."""
+    words = recipe_options.renamed(COMMANDS[name].renamed, words)
     config: tuple[Any, ...] = (tyro.conf.FlagCreatePairsOff,)
     if COMMANDS[name].recipe:
         recipe_options.expect_recipe(words)  # before anything heavy is imported

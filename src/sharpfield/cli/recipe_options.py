@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import inspect
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, get_type_hints
 
 import tyro
@@ -56,7 +56,7 @@ def with_recipe_flags(
     if name is None:
         return _with_parameters(command, others, lambda options: options), list(words)
     recipe = recipe_named(name)()
-    words = [_renamed(recipe, word) for word in words]
+    words = renamed(getattr(recipe, "renamed", {}), words)
     presets = presets_of(recipe)
     recipe = presets.apply(presets.named(_value_of("--preset", words), name), recipe)
     taken = _flags_of(others)
@@ -160,13 +160,15 @@ def _value_of(flag: str, words: Sequence[str]) -> str:
     return ""
 
 
-def _renamed(recipe: Any, word: str) -> str:
-    """An option with its name of today."""
-    if not word.startswith("--"):
-        return word
-    name, equals, value = word[2:].partition("=")
-    new = new_name(recipe, name.replace("-", "_"))
-    if new == name.replace("-", "_"):
-        return word
-    warnings.warn(f"the option --{name} is now --{new}", Hint, stacklevel=2)
-    return f"--{new}{equals}{value}"
+def renamed(names: Mapping[str, str], words: Sequence[str]) -> list[str]:
+    """Words of a command with today's names of options; says which old ones were used."""
+    found: list[str] = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        old = flag[2:].replace("-", "_")
+        new = new_name(names, old) if flag.startswith("--") else old
+        if new != old:
+            new = new.replace("_", "-")
+            warnings.warn(f"the option {flag} is now --{new}", Hint, stacklevel=2)
+        found.append(word if new == old else f"--{new}{equals}{value}")
+    return found

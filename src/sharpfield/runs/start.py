@@ -11,7 +11,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
 from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
 from sharpfield.runs.run import Run
-from sharpfield.training.plan import Options
+from sharpfield.training.options import Options
 from sharpfield.training.session import require_unused, train
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 
 from sharpfield.core.device import device_of
-from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
 from sharpfield.training.loop import fit
 from sharpfield.training.memory import GIB, SHARE, available_bytes, plan_parts
 from sharpfield.training.optim import adam
+from sharpfield.training.options import Options
 
 Build = Callable[[int], Model]
 """Makes the model, on its device, with schedules for so many steps."""
@@ -20,33 +20,6 @@ PROBES = (0.0, 0.25, 0.5, 0.75)
 """Where in the schedule the duration of a step is measured."""
 SLACK = 0.93
 """Part of the time that steps may fill; the rest is for checkpoints, logs and chance."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to train, whatever the recipe."""
-
-    steps: int | None = None
-    """Length of the run; None for what the recipe says, or what `minutes` allow."""
-    minutes: float | int | None = None
-    """Time for this session. A new run gets a schedule that fits into it."""
-    resume: bool = False
-    """Go on with the run in the folder, if there is one."""
-    checkpoint_every: int | None = None
-    """Steps between checkpoints; None for one a minute."""
-    log_every: int = 10
-    """Steps whose losses are averaged to one row of the log."""
-    validate_every: int = 1000
-    """Steps between validations, where there is something to validate with."""
-    memory_gb: float | None = None
-    """Memory for training, in GiB; None for most of what is free."""
-
-    def __post_init__(self) -> None:
-        if self.steps is not None and self.minutes is not None:
-            raise OptionError("--steps and --minutes exclude each other", do="give one of them")
-        for name, value in vars(self).items():
-            if isinstance(value, int | float) and name != "resume" and not value > 0:
-                raise OptionError(f"--{name.replace('_', '-')} must be positive", got=value)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ from sharpfield.training.hooks import every, every_seconds, finite
 from sharpfield.training.log import Log, LogLosses
 from sharpfield.training.loop import Hook, fit
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import Build, Options, Plan, make_plan
+from sharpfield.training.options import Options
+from sharpfield.training.plan import Build, Plan, make_plan
 from sharpfield.training.record import Ledger, Record, read_ledger, write_ledger
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)

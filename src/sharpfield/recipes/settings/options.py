@@ -110,7 +110,7 @@ def current_name(recipe: Any, name: str) -> str:
         OptionError: The recipe has no such option.
     """
     asked, known = name.replace("-", "_"), options_of(recipe)
-    name = new_name(recipe, asked)
+    name = new_name(getattr(recipe, "renamed", {}), asked)
     if name not in known:
         raise OptionError("the recipe has no such option", got=asked, do=did_you_mean(name, known))
     if name != asked:
@@ -118,9 +118,9 @@ def current_name(recipe: Any, name: str) -> str:
     return name
 
 
-def new_name(recipe: Any, name: str) -> str:
-    """The name that replaced an old one; the same, if it is not an old one."""
-    for old, new in getattr(recipe, "renamed", {}).items():
+def new_name(renamed: Mapping[str, str], name: str) -> str:
+    """The name that replaced an old one, or the same; `renamed` may name whole groups."""
+    for old, new in renamed.items():
         if name == old or name.startswith(f"{old}."):
             return new + name.removeprefix(old)
     return name

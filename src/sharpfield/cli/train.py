@@ -1,0 +1,77 @@
+"""`sharpfield train`: train a recipe on a capture."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import Positional
+
+from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
+from sharpfield.cli.arguments import Device, screen
+from sharpfield.cli.recipe_options import hint_at_flags
+from sharpfield.training.options import Options
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What of the recipe, and of the capture, is used."""
+
+    preset: str = ""
+    """Named settings, several with commas between them; `sharpfield recipes describe RECIPE` lists
+    them. Left out, they follow the capture and the machine."""
+    use: tuple[str, ...] = ("frames", "events")
+    """Streams of the capture to learn from."""
+    block: str = ""
+    """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
+    seed: int = 0
+    """Random seed."""
+    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
+    """Options of the recipe, as events.weight=0; better written --events.weight 0."""
+
+
+SELECTION, TRAINING = Selection(), Options()
+
+
+def train_command(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    device: Device = "auto",
+    selection: Selection = SELECTION,
+    training: Options = TRAINING,
+    reading: ReadOptions = NO_OPTIONS,
+    numbers: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Train a recipe on a capture.
+
+    Args:
+        recipe: Name of the recipe; `sharpfield recipes` lists them.
+        capture: Folder of the capture.
+        out: Folder of the run, which must be new unless you resume.
+        device: Device to train on.
+        selection: Presets, streams, block, seed.
+        training: How long, how often to save, how much memory.
+        reading: How to read the capture, where its layout is wrong or silent.
+        numbers: Options of the recipe by name, such as sampling.views.
+    """
+    from sharpfield.captures.read import read_capture
+    from sharpfield.recipes.settings.options import changed, with_options
+    from sharpfield.recipes.settings.presets import prepared
+    from sharpfield.runs.config import RunConfig, device_named
+    from sharpfield.runs.start import start
+
+    hint_at_flags(recipe, selection.change)
+    console, where = screen(), device_named(device)
+    source = read_capture(capture, reading)
+    made = prepared(recipe, selection.preset, capture=source, device=where)
+    made = with_options(changed(made, selection.change), numbers)
+    where_from = str(capture.resolve())
+    started = RunConfig(
+        recipe, made, where_from, selection.seed, selection.use, reading, selection.block
+    )
+    trained = start(started, source, out, training, device=where, console=console)
+    if trained.ledger.finished:
+        console.print(f"Done. `sharpfield evaluate {out}` measures it.")
