@@ -1,11 +1,7 @@
-import math
-import tomllib
-
-import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.storage.toml_tables import read_toml, toml_text
+from sharpfield.storage.toml_tables import read_toml
 
 TEXT = """
 name = "garden"
@@ -79,28 +75,3 @@ def test_not_toml(tmp_path):
     assert "Invalid value" in str(caught.value)
     with pytest.raises(CaptureError, match="file not found"):
         read_toml(tmp_path / "other.toml")
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        *("", "a", "é", '"', "\\", "\n\t\r\b", "\x00\x1f\x7f", "]] #", "'''", "\u2028"),
-        *(0, -1, 2**62, True, False),
-        *(0.1 + 0.2, 1.0, 1e-17, 5e-324, 1e300, -0.0, math.inf, -math.inf),
-        *([], [1, 2], [0.5, 1.0], ["a", "b"], [[1], [2]], [{"a": 1}, {"a": "x", "b": [1.5]}], [{}]),
-        *({}, {"a": 1}, {"a b": {"c": [1]}, "": True}),
-    ],
-)
-def test_what_is_written_reads_back(value):
-    for values in ({"key": value}, {"table": {"key": value}}, {"two words": value, "other": 1}):
-        found = tomllib.loads(toml_text(values))
-        assert found == values and repr(found) == repr(dict(sorted(values.items(), key=order)))
-
-
-def order(item):
-    """Plain values come before tables."""
-    return isinstance(item[1], dict)
-
-
-def test_numpys_floats_are_floats():
-    assert toml_text({"near": np.float64(0.7)}) == "near = 0.7\n"

@@ -241,7 +241,8 @@ def edited(panning, tmp_path, old, new):
 
 
 def test_what_may_be_left_out(panning, tmp_path):
-    found = edited(panning, tmp_path, ', track = 0, use = "train"', "")
+    explicit = ', close_us = 80000, track = 0, use = "train" }'
+    found = edited(panning, tmp_path, ", close_us = 80000 }", explicit)
     assert differences(found, panning) == []
 
 

@@ -98,9 +98,11 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
             "name": frames.names[i],
             "open_us": int(frames.exposure.open_us[i]),
             "close_us": int(frames.exposure.close_us[i]),
-            "track": int(frames.track[i]),
-            "use": USES[bool(learned[i]), bool(held_out[i])],
         }
+        if frames.track[i]:
+            table["track"] = int(frames.track[i])
+        if (use := USES[bool(learned[i]), bool(held_out[i])]) != "train":
+            table["use"] = use
         if file != f"{frames.names[i]}.png":
             table["file"] = file
         if frames.truth is not None:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
@@ -50,7 +51,7 @@ from sharpfield.storage.arrays import expect_replaceable, load_array, load_array
 from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events
-from sharpfield.storage.toml_tables import Table, read_toml, toml_text
+from sharpfield.storage.toml_tables import Table, read_toml
 
 FORMAT, VERSION = "sharpfield-capture", 1
 
@@ -133,7 +134,7 @@ def describe(
         np.save(folder / POINTS, capture.points)
     if arrays:
         write_arrays(folder / NOTES, arrays)
-    (folder / DESCRIPTION).write_text(toml_text(about), encoding="utf-8")
+    (folder / DESCRIPTION).write_text(tomli_w.dumps(about), encoding="utf-8")
 
 
 def read(folder: Path) -> Capture:
