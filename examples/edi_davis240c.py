@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sharpfield.events.edi import latent, path_of_slices
+from sharpfield.events.double_integral import latent, path_of_slices
 from sharpfield.events.log_path import LogPath
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import best_threshold, disagreement

@@ -12,7 +12,7 @@ from sharpfield.core.frames import DepthMaps, Exposure, Frames
 from sharpfield.core.tone import tone_of
 from sharpfield.geometry.trajectory import Still
 from sharpfield.initialisation.from_depth import points_on_surfaces
-from sharpfield.losses.photometric import depth_error
+from sharpfield.losses.photometric import relative_depth_error
 from sharpfield.recipes.splat import RoomSplat
 from sharpfield.sampling.measured_depth import MeasuredDepth
 
@@ -83,8 +83,8 @@ def test_of_neighbours_the_better_frame_is_taken(monkeypatch: pytest.MonkeyPatch
 def test_depth_errors_are_relative_robust_and_only_of_known_pixels():
     drawn = torch.tensor([2.0, 1.0, 50.0, 3.0])
     measured = torch.tensor([2.0, 2.0, 1.0, 0.0])
-    assert depth_error(drawn, measured) == pytest.approx((0 + 0.5 + 1) / 3)
-    assert depth_error(drawn, torch.zeros(4)) == 0
+    assert relative_depth_error(drawn, measured) == pytest.approx((0 + 0.5 + 1) / 3)
+    assert relative_depth_error(drawn, torch.zeros(4)) == 0
 
 
 def test_a_room_learns_its_depth():

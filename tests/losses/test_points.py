@@ -2,7 +2,7 @@
 
 import torch
 
-from sharpfield.losses.photometric import indecision
+from sharpfield.losses.regularizers import indecision
 
 
 def test_one_half_is_worst_and_sides_are_alike():

@@ -83,13 +83,11 @@ def test_a_blurred_image_becomes_sharp() -> None:
     before, after = 0.2, 0.2 * np.exp(0.3)
     blurred = torch.full((1, 2, 1), 0.2)
     blurred[0, 1] = (before + after) / 2
-    sharp = sf.events.edi.sharp_images(
-        blurred, events, (0, 1000), instants_us=[100, 900], threshold=0.3
-    )
+    sharp = sf.events.edi(blurred, events, (0, 1000), instants_us=[100, 900], threshold=0.3)
     assert sharp.shape == (2, 1, 2, 1)
     assert sharp[:, 0, 0].flatten().tolist() == pytest.approx([0.2, 0.2])
     assert sharp[:, 0, 1].flatten().tolist() == pytest.approx([before, after], rel=1e-5)
     with pytest.raises(sf.core.ShapeError, match="other sizes"):
-        sf.events.edi.sharp_images(blurred[:, :1], events, (0, 1000))
+        sf.events.edi(blurred[:, :1], events, (0, 1000))
     with pytest.raises(sf.core.OptionError, match="within the exposure"):
-        sf.events.edi.sharp_images(blurred, events, (0, 1000), instants_us=[2000])
+        sf.events.edi(blurred, events, (0, 1000), instants_us=[2000])

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sharpfield.events.edi import FLOOR
+from sharpfield.events.double_integral import FLOOR
 from sharpfield.events.log_path import LogPath
 from sharpfield.events.threshold import FixedThresholds
 

@@ -12,7 +12,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import tone_of
-from sharpfield.events.edi import latent
+from sharpfield.events.double_integral import latent
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 

@@ -1,11 +1,8 @@
-"""How far predicted changes of log intensity are from what events report.
+"""How far predicted changes of log intensity are from the events that were measured.
 
-Everything is in natural log. `predicted` comes from `formation.LogContrast`, `measured` from
-`EventPairs.measured` with the contrast thresholds.
-
-How far predicted changes of log intensity are from events counted in windows of time.
-
-Everything is in natural log. `measured` is the signed counts times their thresholds.
+Everything is in natural log: `predicted` is the change that a scene makes (`formation.events`),
+`measured` the signed counts of events times their contrast thresholds (`EventPairs.measured`), from
+event to event or in windows of time.
 
 Source: EvDNeRF (WACV 2024) for the normalised error and the dead zone; Robust e-NeRF (ICCV 2023)
 for errors in units of the threshold.
@@ -60,10 +57,10 @@ def silence_error(
     negative: Float[Tensor, "b"],
     positive: Float[Tensor, "b"],
 ) -> Float[Tensor, ""]:
-    """Mean square of how far the change of silent pixels goes beyond a threshold.
+    """Mean square of the excess over a threshold of the change of pixels without events.
 
-    A pixel that reports nothing between two instants has not changed by a whole threshold: that
-    is all it says, so smaller changes cost nothing.
+    A pixel that reports nothing between two instants has not changed by a whole threshold; smaller
+    changes cost nothing.
 
     Args:
         predicted: Change of log intensity between two instants without events.
@@ -82,9 +79,9 @@ def scaled_error(
     scale: float,
     measured_scale: float,
 ) -> Float[Tensor, ""]:
-    """Mean squared difference of both divided by a scale of its own.
+    """Mean squared difference, each side divided by a scale of its own.
 
-    With scales that differ, what is learned is log intensity times `scale / measured_scale`.
+    With different scales the scene learns log intensity times `scale / measured_scale`.
     """
     return (predicted / scale - measured / measured_scale).square().mean()
 
@@ -92,11 +89,11 @@ def scaled_error(
 def dead_zone_error(
     predicted: Float[Tensor, "b"], measured: Float[Tensor, "b"], threshold: float
 ) -> Float[Tensor, ""]:
-    """Mean squared distance from the middle of a zone one threshold wide; nothing inside it.
+    """Mean squared distance from the middle of a dead zone one threshold wide; zero inside it.
 
-    The zone reaches from the measured change to one threshold further from zero, to brighter where
-    nothing was measured. There the distance is that from zero, as published: a small change to
-    darker costs, though it would not have made an event.
+    The zone reaches from the measured change to one threshold further from zero, or to brighter
+    where nothing was measured; in that case the distance is taken from zero, as published, so that
+    a small change to darker costs although it would not have caused an event.
     """
     away = torch.where(measured < 0, -1.0, 1.0)
     beyond = (predicted - measured) * away
@@ -108,7 +105,7 @@ def dead_zone_error(
 def exact_error(
     predicted: Float[Tensor, "b"], measured: Float[Tensor, "b"], threshold: Float[Tensor, "b"]
 ) -> Float[Tensor, ""]:
-    """Mean difference in thresholds where nothing is left over: squared up to one, then linear."""
+    """Mean robust difference in thresholds, for exact measurements: squared to 1, then linear."""
     return _robust((predicted - measured).abs() / threshold).mean()
 
 
@@ -119,15 +116,15 @@ def counted_error(
     *,
     pull: float = 0.0,
 ) -> Float[Tensor, ""]:
-    """The same where less than one threshold is left over at either end of the windows.
+    """The same for whole counts, whose windows may begin and end between two events.
 
-    n more events to brighter than to darker say that the change is between n - 1 and n + 1
-    thresholds. Inside, only `pull` of the difference counts.
+    A net count of n events means a change between n - 1 and n + 1 thresholds. Within that range
+    the difference is weighted by `pull` only.
     """
     off = (predicted - measured).abs() / threshold
     return (_robust((off - 1).clamp_min(0)) + pull * _robust(off)).mean()
 
 
 def _robust(off: Float[Tensor, "b"]) -> Float[Tensor, "b"]:
-    """Huber's, times two."""
+    """Twice the Huber loss with delta 1."""
     return torch.where(off < 1, off.square(), 2 * off - 1)

@@ -1,4 +1,4 @@
-"""Terms that ask for something plausible where the measurements say too little."""
+"""Regularization terms, for what the measurements leave undetermined."""
 
 from collections.abc import Iterable
 
@@ -33,21 +33,39 @@ def alignment(
     *,
     origin_factor: float = 10.0,
 ) -> Float[Tensor, ""]:
-    """How far the first ray of a sparse kernel strays from the pixel it belongs to.
+    """Mean distance of the first ray of a sparse blur kernel from the pixel it belongs to.
 
-    Without it the scene may drift against the kernels, which then shift it back.
+    Without it the scene may be shifted while the kernels shift it back.
 
     Args:
-        offset_px: Where each ray looks, relative to the pixel.
+        offset_px: Pixel position of each ray, relative to the pixel.
         origin: Shift of each ray's origin, world units.
-        origin_factor: How much a unit of the second counts against a pixel of the first.
+        origin_factor: Weight of one world unit of `origin` against one pixel of `offset_px`.
 
     Source: Deblur-NeRF (CVPR 2022), section 3.4; there with weight 0.1.
     """
-    strayed = _length(offset_px[:, 0]) + origin_factor * _length(origin[:, 0])
-    return strayed.mean()
+    distance = _length(offset_px[:, 0]) + origin_factor * _length(origin[:, 0])
+    return distance.mean()
+
+
+NEARLY = 1e-3
+"""Confidences this close to 0 or 1 get no gradient."""
+
+
+def indecision(confidence: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean of log c + log(1 - c): highest at one half, so its descent leads to 0 or 1.
+
+    Args:
+        confidence: 0...1.
+
+    Source: Point-NeRF (CVPR 2022), section 4.2, there with weight 1e-4.
+    """
+    if not len(confidence):
+        return confidence.sum()
+    bounded = confidence.clamp(NEARLY, 1 - NEARLY)
+    return torch.mean(bounded.log() + (1 - bounded).log())
 
 
 def _length(vector: Float[Tensor, "b d"]) -> Float[Tensor, "b"]:
-    """Euclidean, with a finite slope at zero."""
+    """Euclidean length, with a finite gradient at zero."""
     return (vector.square().sum(-1) + 1e-12).sqrt()

@@ -97,7 +97,7 @@ def rasterize(
     canvas: Canvas,
     shift: Float[Tensor, "v n 2"] | None = None,
 ) -> Drawn:
-    """Draw Gaussians from several poses; all arguments that are tensors get gradients.
+    """Render Gaussians from several poses; all arguments that are tensors get gradients.
 
     Args:
         means: In world axes.
@@ -106,9 +106,9 @@ def rasterize(
         opacities: 0...1.
         colours: As each view sees them.
         poses: World-from-camera, OpenCV axes.
-        canvas: What is drawn.
-        shift: Moves splats on the canvas, in pixels. Zeros with a gradient tell how much each one
-            wants to move, which the classic strategy of growing asks.
+        canvas: The camera, and the part of its image that is rendered.
+        shift: Moves splats on the canvas, in pixels. Zeros that require a gradient collect the
+            view-space positional gradients that densification reads.
     """
     splats = project(means, quaternions, scales, opacities, poses, canvas)
     if shift is not None:

@@ -20,7 +20,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.files import write_json
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import luma, tone_of
-from sharpfield.events.edi import FLOOR, joint_latents, latent, published
+from sharpfield.events.double_integral import FLOOR, joint_latents, latent, published
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import edge_density

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import Tone, luma, tone_of
-from sharpfield.events.edi import latent
+from sharpfield.events.double_integral import latent
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import (

@@ -30,7 +30,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import Tone, luma, tone_of
-from sharpfield.events.edi import FLOOR
+from sharpfield.events.double_integral import FLOOR
 from sharpfield.events.index import EventIndex, first_since
 from sharpfield.events.site_colour import site_channels
 from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light, neighbours

@@ -27,7 +27,7 @@ from sharpfield.fields.points.networks import ColourHead, PointSizes
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
 from sharpfield.formation.shutter import Pinhole
 from sharpfield.initialisation.point_cloud import CloudOptions
-from sharpfield.losses.photometric import indecision
+from sharpfield.losses.regularizers import indecision
 from sharpfield.recipes.points.growth import GrowthOptions, grown, missing_points
 from sharpfield.recipes.points.images import ImageBranch, Prepared
 from sharpfield.recipes.points.scene import MarchOptions, PointScene

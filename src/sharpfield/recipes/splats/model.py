@@ -29,7 +29,7 @@ from sharpfield.formation.mixing import mix, mix_of_few
 from sharpfield.geometry.normalise import normalised
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.losses.event_counts import event_terms
-from sharpfield.losses.photometric import depth_error
+from sharpfield.losses.photometric import relative_depth_error
 from sharpfield.metrics.quality import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (
     LearnedCalibration,
@@ -162,7 +162,7 @@ class SplatModel(nn.Module):
             terms["sharp"] = weight * (stored - sharp.value).abs().mean()
         if isinstance(depth := batch.get("depth"), Depths):
             drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
-            terms["depth"] = self.options.depth * depth_error(drawn, depth.value)
+            terms["depth"] = self.options.depth * relative_depth_error(drawn, depth.value)
         if isinstance(events, EventPairs):
             terms |= event_terms(
                 light,

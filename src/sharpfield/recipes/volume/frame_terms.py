@@ -17,7 +17,7 @@ from sharpfield.core.rays import Radiance
 from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Curve, tone_of
-from sharpfield.events.edi import latent_in_light, published
+from sharpfield.events.double_integral import latent_in_light, published
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.formation.shutter import Pinhole, Shutter, expose_at

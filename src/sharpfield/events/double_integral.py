@@ -1,14 +1,14 @@
-"""The event double integral: a sharp image from a blurred one and the events of its exposure.
+"""The event double integral (EDI): a sharp image from a blurred one and the events of its exposure.
 
-Motion blur averages light over the exposure, B = mean of I(t), and events tell how the light of
-each pixel moved, I(t) = I(f) exp(E(t) - E(f)), with E the change of log light since the shutter
-opened. So
+Motion blur averages light over the exposure, B = mean of I(t), and events give the change of each
+pixel, I(t) = I(f) exp(E(t) - E(f)), with E the change of log light since the shutter opened. So
 
     I(f) = B exp(E(f)) / mean of exp(E(t)).
 
-The mean is `exp(path.log_mean)` and E(f) is `path.change`, see `formation.log_path`. This holds for
-linear light; `latent_in_light` decodes stored values first. The published Ev-DeblurNeRF code
-applies it to stored values, with a path made of eight slices: `published`.
+`edi` does this for one image and one event stream. Its parts: the mean is `exp(path.log_mean)` and
+E(f) is `path.change`, see `events.log_path`. This holds for linear light; `latent_in_light` decodes
+stored values first. The published Ev-DeblurNeRF code applies it to stored values, with a path made
+of eight slices: `published`.
 
 Sources: Pan et al., "Bringing a Blurry Frame Alive at High Frame-Rate with an Event Camera"
 (CVPR 2019), and its extension to several exposures (TPAMI 2020).
@@ -22,9 +22,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sharpfield.core.capture import USUAL_THRESHOLD
 from sharpfield.core.errors import OptionError, ShapeError
 from sharpfield.core.events import EventStream
-from sharpfield.core.tone import Tone
+from sharpfield.core.tone import Tone, tone_of
 from sharpfield.events.image import splat_bilinear
 from sharpfield.events.log_path import LogPath, direct, follow
 from sharpfield.events.threshold import FixedThresholds
@@ -36,10 +37,61 @@ FLOOR = 1e-4
 """Linear light added before a logarithm: half a step of 8 bits in the darkest tones."""
 
 
+def edi(
+    blurred: Float[Tensor, "h w c"],
+    events: EventStream,
+    exposure_us: tuple[int, int],
+    *,
+    instants_us: Sequence[int] = (),
+    threshold: float | tuple[float, float] = USUAL_THRESHOLD,
+    encoding: str = "linear",
+) -> Float[Tensor, "k h w c"]:
+    """The sharp images behind one blurred image, from the events of its exposure.
+
+    Args:
+        blurred: As stored, 0...1.
+        events: Of a mono sensor with the same pixels; at least those of the exposure.
+        exposure_us: When the shutter opened and closed.
+        instants_us: When the images are sharp, ascending; by default the middle of the exposure.
+        threshold: Contrast threshold of both signs, or to darker and to brighter; natural log.
+        encoding: Tone curve of the image: linear, gamma2.2 or srgb.
+
+    Returns:
+        Stored values; not clipped where they are linear.
+
+    Raises:
+        ShapeError: Image and events differ in size.
+        OptionError: Events are of several cameras or behind a colour filter, the exposure is
+            empty, or an instant is outside it.
+    """
+    if tuple(blurred.shape[:2]) != (events.height, events.width):
+        raise ShapeError(
+            "image and events have other sizes",
+            got=f"image {tuple(blurred.shape)}, events {events.height} rows of {events.width}",
+            do="crop or warp one to the other",
+        )
+    if events.tracks > 1 or events.coloured:
+        raise OptionError(
+            "edi takes the events of one mono camera", got=events, do="use `deblur` on the capture"
+        )
+    instants = np.asarray(instants_us or [sum(exposure_us) // 2], np.int64)
+    inside = exposure_us[0] <= instants[0] and instants[-1] <= exposure_us[1]
+    if not (exposure_us[0] < exposure_us[1] and inside and (np.diff(instants) >= 0).all()):
+        raise OptionError(
+            "sharp images lie within the exposure, in the order of time",
+            got=f"exposure {exposure_us} us, instants {instants.tolist()} us",
+        )
+    both = threshold if isinstance(threshold, tuple) else (threshold, threshold)
+    spread, tone = direct(width=events.width, height=events.height), tone_of(encoding)
+    path = follow(events, exposure_us, instants, FixedThresholds(*both), spread)
+    light = tone.decode(blurred)
+    return torch.stack([tone.encode(latent(light, path, k)) for k in range(len(instants))])
+
+
 def latent(blurred: Float[Tensor, "h w c"], path: LogPath, instant: int) -> Float[Tensor, "h w c"]:
     """The sharp image at one of the path's instants, in the domain of `blurred`; not clipped.
 
-    A path of one channel moves all colours alike.
+    A path of one channel changes all colours alike.
     """
     return blurred * torch.exp(path.change[instant] - path.log_mean)
 
@@ -52,9 +104,9 @@ def latent_in_light(
 
 
 def path_of_instants(slices: Float[Tensor, "j h w c"]) -> LogPath:
-    """A path from its change in each of j slices, averaged over the j + 1 borders.
+    """A path from its change in each of j slices; the mean is that over the j + 1 borders.
 
-    The published rule. It takes the light at the borders for the light of the whole exposure.
+    The published rule: it samples the exposure at the borders of the slices only.
     """
     change = _borders(slices)
     return LogPath(log_mean=change.logsumexp(0) - math.log(len(change)), change=change)
@@ -71,7 +123,7 @@ def published_slices(
 
     Both ends of a slice belong to it, so that an event exactly on an inner border counts twice.
     Rectified positions are shared bilinearly among the pixels around them; whatever its colour, an
-    event moves all channels.
+    event changes all channels.
     """
     borders = np.linspace(*window_us, stamps)
     first = np.searchsorted(events.t_us, borders[:-1], side="left")
@@ -103,10 +155,10 @@ def published(
 
 
 def path_of_slices(slices: Float[Tensor, "j h w c"]) -> LogPath:
-    """A path from its change in each of j slices, moving evenly inside each.
+    """A path from its change in each of j slices, linear within each.
 
-    The average of exp along a straight line is (exp b - exp a) / (b - a): exact for the broken line
-    through the borders, so that few slices are enough.
+    The mean of exp along a line from a to b is (exp b - exp a) / (b - a): exact for the
+    piecewise-linear path through the borders, so that few slices are enough.
     """
     change = _borders(slices)
     return LogPath(
@@ -141,7 +193,7 @@ def joint_latents(
     once, forwards and backwards along the images.
 
     Args:
-        alone: What each exposure says by itself: log B_i + E(f_i) - log_mean_i.
+        alone: From each exposure by itself: log B_i + E(f_i) - log_mean_i.
         gaps: Change of log light from each image to the next, g = n - 1.
         trust: Weight of each gap's equation; an exposure's is 1.
     """
@@ -159,43 +211,3 @@ def joint_latents(
     for i in range(len(alone) - 2, -1, -1):
         found.append((reduced[i] + after[i] * found[-1]) / pivot[i])
     return torch.stack(found[::-1])
-
-
-def sharp_images(
-    blurred: Float[Tensor, "h w c"],
-    events: EventStream,
-    exposure_us: tuple[int, int],
-    *,
-    instants_us: Sequence[int] = (),
-    threshold: float | tuple[float, float] = 0.2,
-) -> Float[Tensor, "k h w c"]:
-    """The sharp images behind one blurred image and the events of its exposure.
-
-    Args:
-        blurred: Linear light, not stored values.
-        events: Of a mono sensor with the same pixels.
-        exposure_us: When the shutter opened and closed.
-        instants_us: When the images are sharp, ascending; by default the middle of the exposure.
-        threshold: Contrast threshold of both signs, or to darker and to brighter; natural log.
-
-    Raises:
-        ShapeError: Image and events have other sizes.
-        OptionError: The exposure is empty, or an instant is outside it.
-    """
-    if tuple(blurred.shape[:2]) != (events.height, events.width):
-        raise ShapeError(
-            "image and events have other sizes",
-            got=f"image {tuple(blurred.shape)}, events {events.height} rows of {events.width}",
-            do="crop or warp one to the other",
-        )
-    instants = np.asarray(instants_us or [sum(exposure_us) // 2], np.int64)
-    inside = (exposure_us[0] <= instants[0]) and (instants[-1] <= exposure_us[1])
-    if not (exposure_us[0] < exposure_us[1] and inside and (np.diff(instants) >= 0).all()):
-        raise OptionError(
-            "sharp images lie within the exposure, in the order of time",
-            got=f"exposure {exposure_us} us, instants {instants.tolist()} us",
-        )
-    both = (threshold, threshold) if isinstance(threshold, float | int) else threshold
-    spread = direct(width=events.width, height=events.height)
-    path = follow(events, exposure_us, instants, FixedThresholds(*both), spread)
-    return torch.stack([latent(blurred, path, k) for k in range(len(instants))])  # [k, h, w, c]

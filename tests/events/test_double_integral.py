@@ -1,13 +1,17 @@
 """The event double integral: published numbers, closed forms, agreement of exposures."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
-from sharpfield.events import edi
+from sharpfield.events import double_integral as edi
 from sharpfield.events.log_path import LogPath, direct, follow
 from sharpfield.events.threshold import FixedThresholds
 
@@ -140,3 +144,24 @@ def test_gradients() -> None:
         return edi.latent(torch.ones(1, 2, 1, dtype=torch.float64), path, 1)
 
     assert torch.autograd.gradcheck(sharp, (gaps,))
+
+
+def test_stored_values_are_decoded_first() -> None:
+    events = events_of([500], [1])
+    light = torch.tensor([1.5 * 0.2, 0.4, 0.1])[None, :, None]
+    tone = tone_of("srgb")
+    sharp = edi.edi(
+        tone.encode(light),
+        events,
+        (0, 1000),
+        instants_us=[0, 1000],
+        threshold=(0.5, math.log(2)),
+        encoding="srgb",
+    )
+    expected = torch.tensor([[0.2, 0.4, 0.1], [0.4, 0.4, 0.1]])[:, None, :, None]
+    torch.testing.assert_close(tone.decode(sharp), expected)
+
+
+def test_coloured_events_are_refused() -> None:
+    with pytest.raises(OptionError, match="one mono camera"):
+        edi.edi(torch.zeros(1, 3, 1), replace(events_of([1], [1]), bayer="RGGB"), (0, 10))
