@@ -24,7 +24,7 @@ def test_a_capture_of_two_recordings(recorded, capsys):
     assert run("ingest", recorded / "events.h5", recorded / "seen", "--out", out, *words) == 0
     said = capsys.readouterr().out.replace("\n", " ")
     assert "3 frames and" in said and "left out:" in said
-    assert "not known yet: intrinsics, poses, bounds" in said
+    assert "not known yet: poses, intrinsics, bounds" in said
     assert "sharpfield poses" in said
     found = native.read_unposed(out)
     assert found.needed_frames.exposure.window(1) == (20_000, 30_000)
@@ -42,7 +42,7 @@ def test_a_capture_of_two_recordings(recorded, capsys):
         (("--layout", "evt9"), "unknown format"),
         (("--rectify",), "lenses are not known"),
         (("--bayer", "RGB"), "unknown colour filter"),
-        (("--from", 100, "--to", 50), "nothing was recorded in this time"),
+        (("--from", 100, "--to", 50), "nothing was recorded in this time range"),
     ],
 )
 def test_what_makes_no_sense_is_refused(recorded, capsys, words, message):

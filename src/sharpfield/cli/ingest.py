@@ -31,7 +31,7 @@ from sharpfield.preparation.ingest.options import (
     Timing,
     fixed_axes,
 )
-from sharpfield.preparation.ingest.pipeline import Ingested, Progress
+from sharpfield.preparation.ingest.pipeline import IngestSummary, StepProgress
 from sharpfield.preparation.ingest.pipeline import ingest as ingest_recordings
 from sharpfield.recordings.format import Format, ReaderOptions
 from sharpfield.recordings.open import format_named, format_of, open_recording
@@ -146,7 +146,7 @@ def ingest(
         console.print(line, soft_wrap=True)
 
 
-def _summary_lines(ingested: Ingested, out: Path) -> Iterator[str]:
+def _summary_lines(ingested: IngestSummary, out: Path) -> Iterator[str]:
     seconds = (ingested.span_us[1] - ingested.span_us[0]) / 1e6
     counts = f"{ingested.frames:,} frames and {ingested.events:,} events"
     yield f"{counts} over {seconds:.3f} s are in {out}"
@@ -163,7 +163,7 @@ def _summary_lines(ingested: Ingested, out: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _progress(console: Console) -> Iterator[Progress]:
+def _progress(console: Console) -> Iterator[StepProgress]:
     """A progress bar for each step."""
     columns = (
         TextColumn("{task.description}"),

@@ -4,7 +4,12 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.frames import Exposure
-from sharpfield.preparation.ingest.clock import find_offset, shifted, triggered, with_length
+from sharpfield.preparation.ingest.clock import (
+    exposures_from_triggers,
+    find_offset,
+    shifted,
+    with_exposure,
+)
 from sharpfield.recordings.recording import Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.sensors.events import EventPixels, joined
@@ -22,10 +27,10 @@ def activity(seed: int, *, steady: bool = False) -> np.ndarray:
     return draw.poisson(300 * smooth)
 
 
-def seen(per_ms: np.ndarray, lag_us: int, *, noise: float) -> tuple[np.ndarray, np.ndarray]:
+def seen(events_per_ms: np.ndarray, lag_us: int, *, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Middles of exposures on a clock that is late by a lag, and how much images changed."""
     true_us = 300_000 + np.arange(FRAMES, dtype=np.int64) * INTERVAL_US
-    until = np.concatenate([[0], np.cumsum(per_ms)])
+    until = np.concatenate([[0], np.cumsum(events_per_ms)])
     change = np.diff(np.interp(true_us / 1000, np.arange(len(until)), until))
     change = change * (1 + noise * np.random.default_rng(1).standard_normal(len(change)))
     return true_us + lag_us, change
@@ -34,12 +39,12 @@ def seen(per_ms: np.ndarray, lag_us: int, *, noise: float) -> tuple[np.ndarray, 
 @pytest.mark.parametrize("lag_us", [0, 12_345, -250_000, 900_000_000_000])
 @pytest.mark.parametrize("origin_us", [0, 1_600_000_000_000_000])
 def test_the_offset_is_found(lag_us, origin_us):
-    per_ms = activity(0)
-    middles_us, change = seen(per_ms, lag_us, noise=0.2)
-    found = find_offset(change, middles_us + origin_us, per_ms, origin_us)
+    events_per_ms = activity(0)
+    middles_us, change = seen(events_per_ms, lag_us, noise=0.2)
+    found = find_offset(change, middles_us + origin_us, events_per_ms, origin_us)
     assert found.certain, str(found)
-    assert abs(found.offset_us + lag_us) <= max(found.within_us, 2000)
-    assert found.within_us <= 10_000
+    assert abs(found.offset_us + lag_us) <= max(found.uncertainty_us, 2000)
+    assert found.uncertainty_us <= 10_000
 
 
 def shaken(seed: int, threshold: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -78,22 +83,22 @@ def test_the_search_itself_is_not_late_but_events_of_high_thresholds_are():
 
 
 def test_the_best_offset_is_that_of_a_slow_search():
-    per_ms = activity(2)
-    middles_us, change = seen(per_ms, 40_000, noise=0.3)
-    until = np.concatenate([[0], np.cumsum(per_ms)])
+    events_per_ms = activity(2)
+    middles_us, change = seen(events_per_ms, 40_000, noise=0.3)
+    until = np.concatenate([[0], np.cumsum(events_per_ms)])
     ms = (middles_us - middles_us[0] + 500) // 1000
     best = max(
-        range(len(per_ms) - int(ms[-1]) + 1),
+        range(len(events_per_ms) - int(ms[-1]) + 1),
         key=lambda o: np.corrcoef(np.diff(until[ms + o]), change)[0, 1],
     )
-    found = find_offset(change, middles_us, per_ms, 0)
+    found = find_offset(change, middles_us, events_per_ms, 0)
     assert abs(found.offset_us + int(middles_us[0]) - 1000 * best) <= 500
 
 
 def test_steady_motion_tells_nothing():
-    per_ms = activity(0, steady=True)
-    middles_us, change = seen(per_ms, 0, noise=0.2)
-    assert not find_offset(change, middles_us, per_ms, 0).certain
+    events_per_ms = activity(0, steady=True)
+    middles_us, change = seen(events_per_ms, 0, noise=0.2)
+    assert not find_offset(change, middles_us, events_per_ms, 0).certain
 
 
 def test_other_motion_is_not_believed():
@@ -102,12 +107,12 @@ def test_other_motion_is_not_believed():
 
 
 def test_too_few_frames_are_refused():
-    per_ms = activity(0)
-    middles_us, change = seen(per_ms, 0, noise=0.0)
+    events_per_ms = activity(0)
+    middles_us, change = seen(events_per_ms, 0, noise=0.0)
     with pytest.raises(CaptureError, match="too few frames"):
-        find_offset(change[:4], middles_us[:5], per_ms, 0)
+        find_offset(change[:4], middles_us[:5], events_per_ms, 0)
     with pytest.raises(CaptureError, match="cannot have been recorded together"):
-        find_offset(change, middles_us, per_ms[:50], 0)
+        find_offset(change, middles_us, events_per_ms[:50], 0)
 
 
 # Exposures
@@ -128,24 +133,24 @@ def instants() -> Exposure:
     ],
 )
 def test_exposures_get_their_length(length, stamp, first):
-    assert with_length(instants(), length, stamp).window(0) == first
+    assert with_exposure(instants(), length, stamp).window(0) == first
 
 
 def test_exposures_with_a_length_keep_it():
     known = Exposure(np.array([0, 40_000]), np.array([5_000, 40_000]))
-    found = with_length(known, "10ms", "open")
+    found = with_exposure(known, "10ms", "open")
     assert [found.window(0), found.window(1)] == [(0, 5_000), (40_000, 50_000)]
 
 
 @pytest.mark.parametrize("length", ["", "fast", "1.5", "-3ms", "infs"])
 def test_a_length_that_cannot_be_read(length):
     with pytest.raises(OptionError, match="cannot read the exposure"):
-        with_length(instants(), length, "open")
+        with_exposure(instants(), length, "open")
 
 
 def test_exposures_that_would_overlap():
     with pytest.raises(OptionError, match="would overlap"):
-        with_length(instants(), "50ms", "open")
+        with_exposure(instants(), "50ms", "open")
 
 
 def test_shifting_and_back():
@@ -173,7 +178,7 @@ def both(a: Triggers, b: Triggers) -> Triggers:
 
 
 def test_pulses_are_exposures():
-    found = triggered(pulses(3), 3, channel=None, where="cam.raw")
+    found = exposures_from_triggers(pulses(3), 3, channel=None, where="cam.raw")
     assert [found.window(i) for i in range(3)] == [
         (500, 4_500),
         (10_500, 14_500),
@@ -184,18 +189,21 @@ def test_pulses_are_exposures():
 def test_an_edge_before_the_first_pulse_is_no_exposure():
     late = pulses(3)
     truncated = Triggers(late.t_us[1:], late.edge[1:], late.channel[1:])
-    assert triggered(truncated, 2, channel=None, where="cam.raw").window(0) == (10_500, 14_500)
+    assert exposures_from_triggers(truncated, 2, channel=None, where="cam.raw").window(0) == (
+        10_500,
+        14_500,
+    )
 
 
 def test_one_of_several_channels_has_to_be_named():
     mixed = both(pulses(3), pulses(5, channel=6))
     with pytest.raises(CaptureError, match="several channels") as caught:
-        triggered(mixed, 3, channel=None, where="cam.raw")
+        exposures_from_triggers(mixed, 3, channel=None, where="cam.raw")
     assert "0, 6" in str(caught.value)
-    assert len(triggered(mixed, 5, channel=6, where="cam.raw")) == 5
+    assert len(exposures_from_triggers(mixed, 5, channel=6, where="cam.raw")) == 5
 
 
 @pytest.mark.parametrize("count", [2, 4])
 def test_there_must_be_a_pulse_for_each_frame(count):
     with pytest.raises(CaptureError, match=f"3 pulses, {count} frames"):
-        triggered(pulses(3), count, channel=None, where="cam.raw")
+        exposures_from_triggers(pulses(3), count, channel=None, where="cam.raw")

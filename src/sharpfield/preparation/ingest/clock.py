@@ -1,10 +1,10 @@
-"""When frames were exposed, on the clock of the events.
+"""Exposure times of frames on the clock of the events.
 
-Two cameras each have a clock. Where the one that takes frames tells the other when its shutter
-opens and closes, by a wire, *triggers* say it exactly. Otherwise the *offset* of one clock to the
-other is found by what both see: images change most from one to the next when most events happen.
-That works where motion is uneven, and says nothing where it is steady, so the result comes with
-its certainty.
+Two cameras have two clocks. Where the frame camera signals the opening and closing of its shutter
+to the event camera by wire, *triggers* give the exposures exactly. Otherwise the *offset* between
+the clocks is estimated from what both cameras see: images change most from one to the next when
+most events occur. This needs uneven motion and fails with steady motion, so the estimate comes with
+its significance.
 """
 
 from dataclasses import dataclass, replace
@@ -18,61 +18,61 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.frames import Exposure
 from sharpfield.recordings.recording import Triggers
 
-FEWEST = 8
-"""Pairs of frames from which anything is concluded."""
-HALF = 0.5
-"""At least this share of the frames must have been taken while events were."""
-LEAST = 0.5
-"""Correlation below which an offset is not believed."""
-SIGMAS = 3.0
-"""By so many standard errors it must beat the next best one."""
-MOST = 3000
-"""Frames looked at; of longer recordings, those in the middle."""
+MIN_PAIRS = 8
+"""Fewest pairs of consecutive frames for an estimate."""
+MIN_OVERLAP = 0.5
+"""Share of the frame pairs that must lie within the time of the events."""
+MIN_CORRELATION = 0.5
+"""An offset with a lower correlation is rejected."""
+MIN_SIGMAS = 3.0
+"""Standard errors by which the best offset must exceed the second best."""
+MAX_PAIRS = 3000
+"""Frame pairs used; of longer recordings, those in the middle."""
 STEPS = 4
-"""Offsets tried within the time of one frame, before the best is looked at more closely."""
+"""Offsets offsets_ms per frame interval in the coarse search."""
 
 Stamp = Literal["open", "middle", "close"]
-"""What the single time of a frame means."""
+"""Meaning of the single time of a frame."""
 
 
 @dataclass(frozen=True)
-class Offset:
-    """What is to be added to times of frames to have them on the clock of the events."""
+class ClockOffset:
+    """Estimated offset to add to frame times to convert them to the clock of the events."""
 
     offset_us: int
     correlation: float
-    """Of the change of images with the number of events, at this offset."""
+    """Correlation between the change of images and the number of events, at this offset."""
     runner_up: float
-    """The same of the best offset that does not lie on the same hill."""
-    within_us: int
-    """Offsets that fit as well, up to chance, lie no farther off."""
+    """Correlation of the best offset outside the same peak."""
+    uncertainty_us: int
+    """Offsets that are not significantly worse differ by no more than this."""
     sigmas: float
-    """How clearly it beats the next best."""
+    """Difference to the second best offset, in standard errors."""
 
     @property
     def certain(self) -> bool:
-        """Whether to believe it."""
-        return self.correlation >= LEAST and self.sigmas >= SIGMAS
+        """Whether the offset is significant."""
+        return self.correlation >= MIN_CORRELATION and self.sigmas >= MIN_SIGMAS
 
     def __str__(self) -> str:
-        """In words."""
+        """The offset with its uncertainty, in words."""
         return (
-            f"{self.offset_us / 1000:.1f} ms, give or take {self.within_us / 1000:.1f} ms"
+            f"{self.offset_us / 1000:.1f} ms, give or take {self.uncertainty_us / 1000:.1f} ms"
             f" (correlation {self.correlation:.2f}, next best {self.runner_up:.2f},"
             f" {self.sigmas:.1f} sigma apart)"
         )
 
 
-def with_length(exposure: Exposure, length: str, stamp: Stamp) -> Exposure:
-    """Exposures of some length in place of instants; those that have a length keep it.
+def with_exposure(exposure: Exposure, length: str, stamp: Stamp) -> Exposure:
+    """Give frames with a single time an exposure; frames that have an exposure keep it.
 
     Args:
-        exposure: As the recording tells.
-        length: A share of the time to the next frame, like "0.5", or a time, like "8ms".
-        stamp: Whether the single time of a frame is when its shutter opens, is half way, or closes.
+        exposure: Exposures as recorded.
+        length: Exposure as a share of the frame interval, like "0.5", or as a time, like "8ms".
+        stamp: Whether the single time is the opening, the middle or the closing of the shutter.
 
     Raises:
-        OptionError: The length cannot be read, or exposures would overlap.
+        OptionError: The length cannot be parsed, or exposures would overlap.
     """
     length_us = _length_us(length, exposure)
     before = {"open": 0, "middle": length_us // 2, "close": length_us}[stamp]
@@ -87,17 +87,19 @@ def with_length(exposure: Exposure, length: str, stamp: Stamp) -> Exposure:
     return Exposure(opens, closes)
 
 
-def triggered(triggers: Triggers, count: int, *, channel: int | None, where: object) -> Exposure:
-    """Exposures between a rising edge and the falling one after it.
+def exposures_from_triggers(
+    triggers: Triggers, count: int, *, channel: int | None, where: object
+) -> Exposure:
+    """Exposures from trigger pulses, each from a rising to the next falling edge.
 
     Args:
         triggers: Edges, on the clock of the events.
-        count: Of the frames; there must be as many pulses.
-        channel: Of the edges, where there are several.
+        count: Number of frames; there must be as many pulses.
+        channel: Trigger channel, where there are several.
         where: The recording, for messages.
 
     Raises:
-        CaptureError: There are several channels and none is named, or not one pulse a frame.
+        CaptureError: There are several channels and none was chosen, or not one pulse per frame.
     """
     channels = np.unique(triggers.channel)
     if channel is None and len(channels) > 1:
@@ -129,65 +131,68 @@ def triggered(triggers: Triggers, count: int, *, channel: int | None, where: obj
 def find_offset(
     change: Float64[np.ndarray, "n"],
     middles_us: Int64[np.ndarray, "m"],
-    per_ms: Int64[np.ndarray, "k"],
+    events_per_ms: Int64[np.ndarray, "k"],
     origin_us: int,
-) -> Offset:
-    """The offset at which images change as much as there are events.
+) -> ClockOffset:
+    """Find the offset with the highest correlation between image change and event count.
 
     Args:
-        change: How much each image differs from the one before it; one fewer than images.
-        middles_us: When each image was exposed, on the frames' clock.
-        per_ms: Events in each ms.
-        origin_us: Where `per_ms` begins, on the events' clock.
+        change: Difference of each image to the previous one; one entry fewer than images.
+        middles_us: Middle of each exposure, on the clock of the frames.
+        events_per_ms: Number of events in each ms.
+        origin_us: Begin of `events_per_ms`, on the clock of the events.
 
     Raises:
         CaptureError: There are too few frames.
     """
-    if len(change) < FEWEST:
+    if len(change) < MIN_PAIRS:
         raise CaptureError(
             "too few frames to find the offset between two clocks",
             got=f"{len(middles_us)} frames",
             do="give the offset",
         )
-    until = np.concatenate([[0], np.cumsum(per_ms)]).astype(np.float64)
-    skipped = max(len(change) - MOST, 0) // 2
-    change, middles_us = change[skipped : skipped + MOST], middles_us[skipped : skipped + MOST + 1]
+    cumulative = np.concatenate([[0], np.cumsum(events_per_ms)]).astype(np.float64)
+    skipped = max(len(change) - MAX_PAIRS, 0) // 2
+    change, middles_us = (
+        change[skipped : skipped + MAX_PAIRS],
+        middles_us[skipped : skipped + MAX_PAIRS + 1],
+    )
     ms = (middles_us - middles_us[0] + 500) // 1000
     interval = max(int(np.median(np.diff(ms))), 1)
     step = max(interval // STEPS, 1)
-    fewest = max(FEWEST, int(HALF * len(change)))
-    tried = np.arange(-int(ms[-1]), len(per_ms) + 1, step, dtype=np.int64)
-    found = _correlations(ms, change, until, tried, fewest)
+    fewest = max(MIN_PAIRS, int(MIN_OVERLAP * len(change)))
+    offsets_ms = np.arange(-int(ms[-1]), len(events_per_ms) + 1, step, dtype=np.int64)
+    found = _correlations(ms, change, cumulative, offsets_ms, fewest)
     if np.isnan(found).all():
         raise CaptureError(
             "frames and events cannot have been recorded together",
-            got=f"frames over {ms[-1] / 1000:.1f} s, events over {len(per_ms) / 1000:.1f} s",
+            got=f"frames over {ms[-1] / 1000:.1f} s, events over {len(events_per_ms) / 1000:.1f} s",
             do="give recordings of the same time",
         )
     filled = np.nan_to_num(found, nan=-1.0)
-    far = ~_hill(filled)
+    far = ~_peak_region(filled)
     runner_up = float(filled[far].max()) if far.any() else -1.0
-    tried = tried[filled.argmax()] + np.arange(-interval, interval + 1)
-    filled = np.nan_to_num(_correlations(ms, change, until, tried, fewest), nan=-1.0)
+    offsets_ms = offsets_ms[filled.argmax()] + np.arange(-interval, interval + 1)
+    filled = np.nan_to_num(_correlations(ms, change, cumulative, offsets_ms, fewest), nan=-1.0)
     best = int(filled.argmax())
-    error = 1 / np.sqrt(len(change) - 3)  # of Fisher's transform of a correlation
+    error = 1 / np.sqrt(len(change) - 3)  # standard error of Fisher's transform of a correlation
     clear = _fisher(filled)
     good = np.flatnonzero(clear >= clear[best] - error)
-    offset_us = round(1000 * (float(tried[best]) + _vertex(filled, best)))
-    return Offset(
+    offset_us = round(1000 * (float(offsets_ms[best]) + _parabola_peak(filled, best)))
+    return ClockOffset(
         offset_us=offset_us + origin_us - int(middles_us[0]),
         correlation=float(filled[best]),
         runner_up=runner_up,
-        within_us=1000 * max(int(np.abs(tried[good] - tried[best]).max()), 1),
+        uncertainty_us=1000 * max(int(np.abs(offsets_ms[good] - offsets_ms[best]).max()), 1),
         sigmas=float((clear[best] - _fisher(np.array(runner_up))) / (error * np.sqrt(2))),
     )
 
 
-def accepted_offset(offset: Offset, where: object) -> int:
-    """The offset in us, if it is certain; 0 if the clocks may as well be the same.
+def accepted_offset(offset: ClockOffset, where: object) -> int:
+    """The offset in us if it is significant; 0 if it does not differ from 0.
 
     Raises:
-        CaptureError: It is not certain.
+        CaptureError: The offset is not significant.
     """
     if not offset.certain:
         raise CaptureError(
@@ -196,35 +201,35 @@ def accepted_offset(offset: Offset, where: object) -> int:
             got=f"the best offset is {offset}",
             do="give --offset-ms, or --clock same if both were on one clock",
         )
-    return 0 if abs(offset.offset_us) <= offset.within_us else offset.offset_us
+    return 0 if abs(offset.offset_us) <= offset.uncertainty_us else offset.offset_us
 
 
 def shifted(exposure: Exposure, offset_us: int) -> Exposure:
-    """The same exposures on another clock."""
+    """Exposures with an offset added to their times."""
     return replace(
         exposure, open_us=exposure.open_us + offset_us, close_us=exposure.close_us + offset_us
     )
 
 
 def _fisher(correlation: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
-    """A transform of correlations whose errors are alike."""
+    """Fisher's transform, which makes the standard error of a correlation constant."""
     return np.asarray(np.arctanh(np.clip(correlation, -0.999999, 0.999999)))
 
 
-def _hill(values: Float64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-    """The stretch around the highest value on which none is less than half of it."""
+def _peak_region(values: Float64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Mask of the interval around the maximum on which values are at least half of it."""
     best = int(values.argmax())
-    low = np.flatnonzero(values < HALF * values[best])
+    low = np.flatnonzero(values < 0.5 * values[best])
     before, after = low[low < best], low[low > best]
     first = before[-1] + 1 if len(before) else 0
     last = after[0] if len(after) else len(values)
-    hill = np.zeros(len(values), bool)
-    hill[first:last] = True
-    return hill
+    region = np.zeros(len(values), bool)
+    region[first:last] = True
+    return region
 
 
-def _vertex(values: Float64[np.ndarray, "n"], at: int) -> float:
-    """Where between its neighbours the peak of a parabola through three values lies."""
+def _parabola_peak(values: Float64[np.ndarray, "n"], at: int) -> float:
+    """Subsample position of a peak relative to its index, from a parabola through 3 values."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, peak, after = values[at - 1 : at + 2]
@@ -253,23 +258,23 @@ def _length_us(length: str, exposure: Exposure) -> int:
 
 
 def _interval_us(exposure: Exposure) -> int:
-    """The shortest time from one frame to the next."""
+    """Shortest frame interval."""
     gaps = np.diff(exposure.open_us)
     return int(gaps.min()) if len(gaps) else 0
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _correlations(ms, change, until, tried, fewest):
-    """Correlation of changes with counts between frames at each offset in ms; nan if too few."""
-    found = np.full(tried.size, np.nan)
-    for i in range(tried.size):
+def _correlations(ms, change, cumulative, offsets_ms, fewest):
+    """Correlation of image change and event count at each offset; nan without enough pairs."""
+    found = np.full(offsets_ms.size, np.nan)
+    for i in range(offsets_ms.size):
         n, a, b, aa, bb, ab = 0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(change.size):
-            begin, end = ms[k] + tried[i], ms[k + 1] + tried[i]
-            if begin < 0 or end >= until.size:
+            begin, end = ms[k] + offsets_ms[i], ms[k + 1] + offsets_ms[i]
+            if begin < 0 or end >= cumulative.size:
                 continue
-            count, seen = until[end] - until[begin], change[k]
+            count, seen = cumulative[end] - cumulative[begin], change[k]
             n += 1
             a += seen
             b += count

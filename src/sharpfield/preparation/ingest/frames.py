@@ -1,4 +1,4 @@
-"""Frames of a recording, written one by one while they are read."""
+"""Writing the frames of a recording as PNG files, one by one while they are read."""
 
 import json
 import re
@@ -14,22 +14,22 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 from sharpfield.captures.native.frames import PLAIN_NAME
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import write_json
-from sharpfield.preparation.ingest.lens import Geometry
+from sharpfield.preparation.ingest.lens import CaptureGeometry
 from sharpfield.recordings.recording import Frame
 from sharpfield.storage.images import write_image
 
-SMALL = 64
-"""Width in pixels of the images whose change is measured."""
+CHANGE_WIDTH = 64
+"""Width in pixels to which images are reduced to measure their change."""
 FLOOR = 1 / 255
-"""Light below which no logarithm is taken."""
+"""Lower limit of light before the logarithm."""
 
 
 @dataclass(frozen=True)
 class WrittenFrames:
-    """The frames that were written."""
+    """Frames that were written."""
 
     names: tuple[str, ...]
-    """Files are `NAME.png`."""
+    """File names without `.png`."""
     open_us: Int64[np.ndarray, "n"]
     close_us: Int64[np.ndarray, "n"]
     change: Float64[np.ndarray, "m"]
@@ -37,10 +37,10 @@ class WrittenFrames:
     shape: tuple[int, int, int]
     bits: int
 
-    def picked(self, keep: Shaped[np.ndarray, "n"]) -> "Taken":
-        """Some of the frames; changes are dropped."""
+    def selected(self, keep: Shaped[np.ndarray, "n"]) -> "WrittenFrames":
+        """Some of the frames, without their changes."""
         return WrittenFrames(
-            tuple(name for name, kept in zip(self.names, keep, strict=True) if kept),
+            tuple(name for name, is_kept in zip(self.names, keep, strict=True) if is_kept),
             self.open_us[keep],
             self.close_us[keep],
             np.empty(0),
@@ -49,24 +49,24 @@ class WrittenFrames:
         )
 
 
-def write_frames_of(
+def write_frames(
     frames: Iterator[Frame],
     folder: Path,
-    lens: Geometry,
+    lens: CaptureGeometry,
     bayer: str,
-    heard: Callable[[int], None],
+    progress: Callable[[int], None],
 ) -> WrittenFrames:
-    """Write all frames to a folder; those that are there already are left as they are.
+    """Write all frames to a folder; files that exist already are kept.
 
     Args:
-        frames: In the order of time.
-        folder: Of the images.
-        lens: How images come to the capture's pixels.
-        bayer: Filter tile of the sensor, where images are raw.
-        heard: Is told how many were written.
+        frames: Frames in the order of time.
+        folder: Folder of the images.
+        lens: Maps images to the pixels of the capture.
+        bayer: Colour filter array of the sensor, where images are raw.
+        progress: Called with the number of frames written.
 
     Raises:
-        CaptureError: There are none, or they differ in size or type.
+        CaptureError: There are no frames, or they differ in size or type.
     """
     names: list[str] = []
     known: set[str] = set()
@@ -76,7 +76,7 @@ def write_frames_of(
     shape: tuple[int, int, int] | None = None
     bits = 8
     for number, frame in enumerate(frames):
-        image = lens.image(frame.image, bayer)
+        image = lens.mapped_image(frame.image, bayer)
         bits = 8 * image.dtype.itemsize
         if shape is not None and image.shape != shape:
             raise CaptureError(
@@ -95,42 +95,42 @@ def write_frames_of(
         if before is not None:
             change.append(float(np.abs(small - before).mean()))
         before = small
-        heard(number + 1)
+        progress(number + 1)
     if shape is None:
         raise CaptureError("the recording holds no frames", where=folder)
     opens, closes = np.array(times, np.int64).T
     return WrittenFrames(tuple(names), opens, closes, np.array(change), shape, bits)
 
 
-def save_frames(taken: WrittenFrames, path: Path) -> None:
-    """Write down which frames were taken, when all of them were."""
-    about: dict[str, Any] = {
-        "names": taken.names,
-        "open_us": taken.open_us.tolist(),
-        "close_us": taken.close_us.tolist(),
-        "change": taken.change.tolist(),
-        "shape": taken.shape,
-        "bits": taken.bits,
+def save_frames(frames: WrittenFrames, path: Path) -> None:
+    """Save the record of all frames after the last one was written."""
+    record: dict[str, Any] = {
+        "names": frames.names,
+        "open_us": frames.open_us.tolist(),
+        "close_us": frames.close_us.tolist(),
+        "change": frames.change.tolist(),
+        "shape": frames.shape,
+        "bits": frames.bits,
     }
-    write_json(path, about)
+    write_json(path, record)
 
 
 def load_frames(path: Path) -> WrittenFrames:
-    """What `save_frames` wrote."""
-    about = json.loads(path.read_text())
-    height, width, channels = about["shape"]
+    """Load what `save_frames` saved."""
+    record = json.loads(path.read_text())
+    height, width, channels = record["shape"]
     return WrittenFrames(
-        tuple(about["names"]),
-        np.array(about["open_us"], np.int64),
-        np.array(about["close_us"], np.int64),
-        np.array(about["change"], np.float64),
+        tuple(record["names"]),
+        np.array(record["open_us"], np.int64),
+        np.array(record["close_us"], np.int64),
+        np.array(record["change"], np.float64),
         (height, width, channels),
-        about["bits"],
+        record["bits"],
     )
 
 
 def _name(own: str, number: int, known: set[str]) -> str:
-    """The frame's own name where every file system can hold it and it is new, else its number."""
+    """The frame's own name if it is new and valid on every file system, else its number."""
     stem = re.sub(r"\.(png|jpe?g)$", "", own, flags=re.I)
     for name in (stem, f"{number:06d}"):
         if PLAIN_NAME.fullmatch(name) and name.casefold() not in known:
@@ -141,10 +141,10 @@ def _name(own: str, number: int, known: set[str]) -> str:
 
 
 def _log_small(image: Shaped[np.ndarray, "h w c"]) -> Float32[np.ndarray, "y x"]:
-    """The logarithm of what a image looks like from afar."""
+    """Logarithm of an image that is reduced to `CHANGE_WIDTH`."""
     height, width = image.shape[:2]
     grey = image.mean(-1, dtype=np.float32) / np.iinfo(image.dtype).max
-    scale = min(SMALL / width, 1.0)
+    scale = min(CHANGE_WIDTH / width, 1.0)
     size = max(round(width * scale), 1), max(round(height * scale), 1)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     return np.log(np.maximum(small, FLOOR))

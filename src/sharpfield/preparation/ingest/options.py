@@ -1,8 +1,6 @@
-"""What can be chosen when a recording is ingested; the command line has an option for each.
+"""Options of `ingest`, and correction of wrong event axes and polarities.
 
-Mistakes of the writer of a recording, undone: axes exchanged or mirrored, signs flipped.
-
-`sharpfield doctor` finds them by comparing events with frames.
+`sharpfield doctor` detects such errors by comparing events with frames.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,18 +18,18 @@ from sharpfield.recordings.recording import Chunks, Recording
 
 @dataclass(frozen=True)
 class Cleaning:
-    """Which events to leave out."""
+    """Event filters."""
 
     hot: float = 10.0
-    """Silence pixels that report so many times as often as the pixels around them; 0 keeps all."""
-    lonely_ms: float = 0.0
-    """Leave out events that none of the eight pixels around joined within so long before; this
-    takes noise, and some of the signal. 0 keeps all."""
+    """Remove hot pixels: those with so many times the events of the pixels around them. 0: none."""
+    isolated_ms: float = 0.0
+    """Remove events without another event at the 8 neighbouring pixels in the ms before: noise, and
+    some signal. 0: none."""
 
 
 @dataclass(frozen=True)
 class Crop:
-    """Which part to keep, in ms from the first event."""
+    """Time range to keep, in ms from the first event."""
 
     start_ms: float | None = None
     end_ms: float | None = None
@@ -42,41 +40,41 @@ class Timing:
     """When frames were exposed."""
 
     exposure: str | None = None
-    """How long the shutter was open, where the recording does not say: 8ms, or 0.5 of the time
-    from one frame to the next. Without it such frames are taken for instants, free of blur."""
+    """Exposure time, where the recording does not give it: 8ms, or 0.5 of the frame interval.
+    Without it such frames are treated as instants, free of blur."""
     stamp: Stamp = "open"
-    """What the single time of such a frame is: its shutter's opening, the middle, its closing."""
+    """Meaning of the single time of such a frame: shutter opening, middle, or closing."""
     clock: Literal["auto", "same", "triggers", "find"] = "auto"
-    """How the times of frames of a second recording come to the clock of the events: `same` if
-    both were on one clock, `triggers` if the frame camera drives a trigger of the other, `find` by
-    what both see. By default triggers if there are any, else find."""
+    """How frame times of a second recording are converted to the clock of the events: `same` if
+    both have one clock, `triggers` if the frame camera drives a trigger input of the event camera,
+    `find` by correlating what both see. By default triggers if there are any, else find."""
     trigger_channel: int | None = None
-    """The one that the frame camera drives, where there are several."""
+    """Trigger channel that the frame camera drives, where there are several."""
     offset_ms: float | None = None
-    """What to add to the times of the frames; nothing is searched for then."""
+    """Offset to add to the frame times in ms, instead of searching for it."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known besides."""
+    """Poses, depth bounds, colour."""
 
     poses: Path | None = None
-    """Where the camera was: TUM's format, or the trajectory.npz of a capture."""
+    """File of camera poses: TUM format, or the trajectory.npz of a capture."""
     near: float | None = None
-    """Nearest depth of the scene, in units of the poses."""
+    """Smallest depth of the scene, in units of the poses."""
     far: float | None = None
-    """Farthest."""
+    """Largest depth of the scene."""
     encoding: str | None = None
-    """How stored values of frames relate to light: linear, gamma2.2 or srgb. By default srgb for
-    videos and images, linear for raw colour, else gamma2.2."""
+    """Encoding of the pixel values: linear, gamma2.2 or srgb. By default srgb for videos and
+    images, linear for raw colour, else gamma2.2."""
     bayer: str | None = None
-    """Colour filter tile of the sensor, where the recording does not say: RGGB, GRBG, GBRG, BGGR;
-    or `none`."""
+    """Colour filter array of the sensor, where the recording does not give it: RGGB, GRBG, GBRG,
+    BGGR; or `none`."""
 
 
 @dataclass(frozen=True)
 class IngestOptions:
-    """Everything that can be chosen."""
+    """All options of `ingest`."""
 
     optics: Optics = field(default_factory=Optics)
     cleaning: Cleaning = field(default_factory=Cleaning)
@@ -85,13 +83,13 @@ class IngestOptions:
     scene: Scene = field(default_factory=Scene)
 
 
-def roles(
+def assign_roles(
     recordings: tuple[Recording, ...],
 ) -> tuple[Recording | None, Recording | None]:
-    """Which recording gives the events, and which the frames.
+    """The recording that gives the events, and the one that gives the frames.
 
     Raises:
-        OptionError: There are too many, or both give the same.
+        OptionError: There are too many, or both hold the same kind of data.
     """
     with_events = [one for one in recordings if one.events is not None]
     with_frames = [one for one in recordings if one.frames is not None]
@@ -110,19 +108,19 @@ def roles(
 
 @dataclass(frozen=True)
 class AxisFixes:
-    """What is wrong with the events of a recording."""
+    """Errors of the event axes and polarities in a file."""
 
     swap_xy: bool = False
-    """Columns and rows are exchanged."""
+    """Exchange columns and rows."""
     flip_x: bool = False
-    """Columns count from the right, after any exchange."""
+    """Mirror columns, after any exchange."""
     flip_y: bool = False
-    """Rows count from the bottom."""
+    """Mirror rows."""
     flip_polarity: bool = False
-    """Brighter is said to be darker."""
+    """Invert polarities."""
 
     def __str__(self) -> str:
-        """In words; nothing if nothing is wrong."""
+        """The errors in words; empty if there are none."""
         words = {
             "x and y exchanged": self.swap_xy,
             "x mirrored": self.flip_x,
@@ -132,31 +130,31 @@ class AxisFixes:
         return ", ".join(word for word, wrong in words.items() if wrong)
 
 
-def fixed_axes(recording: Recording, mistakes: AxisFixes) -> Recording:
-    """The same recording without the mistakes; its frames are as they were.
+def fixed_axes(recording: Recording, fixes: AxisFixes) -> Recording:
+    """A recording with corrected events; frames are unchanged.
 
-    The size of a recording whose axes are exchanged is taken to be exchanged as well.
+    Where axes are exchanged, width and height of the sensor are exchanged as well.
     """
-    if not str(mistakes) or recording.events is None:
+    if not str(fixes) or recording.events is None:
         return recording
     opened, size = recording.events, recording.size
-    if size is not None and mistakes.swap_xy:
+    if size is not None and fixes.swap_xy:
         size = size[::-1]
 
     def events() -> Chunks:
-        return (_mended(chunk, mistakes) for chunk in opened())
+        return (_fixed(chunk, fixes) for chunk in opened())
 
-    layout = f"{recording.layout} ({mistakes})"
+    layout = f"{recording.layout} ({fixes})"
     return replace(recording, events=events, size=size, layout=layout)
 
 
-def _mended(events: EventStream, mistakes: AxisFixes) -> EventStream:
+def _fixed(events: EventStream, fixes: AxisFixes) -> EventStream:
     x, y, width, height = events.x, events.y, events.width, events.height
-    if mistakes.swap_xy:
+    if fixes.swap_xy:
         x, y, width, height = y, x, height, width
-    if mistakes.flip_x:
+    if fixes.flip_x:
         x = (width - 1 - x).astype(x.dtype)
-    if mistakes.flip_y:
+    if fixes.flip_y:
         y = (height - 1 - y).astype(y.dtype)
-    p = (-events.p).astype(np.int8) if mistakes.flip_polarity else events.p
+    p = (-events.p).astype(np.int8) if fixes.flip_polarity else events.p
     return replace(events, x=x, y=y, p=p, width=width, height=height)

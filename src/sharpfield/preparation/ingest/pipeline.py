@@ -1,9 +1,8 @@
-"""From a recording to a capture: what the camera wrote, checked, cleaned and on one clock.
+"""Ingestion: from recordings to a capture, checked, cleaned and on one clock.
 
-Nothing is held in memory but a chunk of events and a frame, and nothing is lost when it is
-interrupted: the same call goes on (`preparation.ingest_stage`). Whatever is left out is counted
-and told. What nobody knows yet, poses above all, is a stand-in and a note says so: see
-`captures.native.read_unposed`.
+Memory holds one chunk of events and one frame at a time. An interrupted ingestion continues with
+the same call, see `ingest.stage`. Everything left out is counted and reported. What is unknown yet,
+poses above all, is a placeholder, and `Capture.known` says so: see `captures.native`.
 """
 
 import json
@@ -24,138 +23,140 @@ from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry.trajectory import Stamped, Still
 from sharpfield.preparation.ingest.clock import (
     accepted_offset,
+    exposures_from_triggers,
     find_offset,
     shifted,
-    triggered,
-    with_length,
+    with_exposure,
 )
 from sharpfield.preparation.ingest.frames import (
     WrittenFrames,
     load_frames,
     save_frames,
-    write_frames_of,
+    write_frames,
 )
-from sharpfield.preparation.ingest.lens import DEMOSAIC, Geometry, geometry, no_events
-from sharpfield.preparation.ingest.options import IngestOptions, roles
-from sharpfield.preparation.ingest.stage import Stage, fingerprint, plain
-from sharpfield.preparation.ingest.survey import Sieve, Survey, hot_pixels, survey
+from sharpfield.preparation.ingest.lens import (
+    DEMOSAIC,
+    CaptureGeometry,
+    capture_geometry,
+    empty_stream,
+)
+from sharpfield.preparation.ingest.options import IngestOptions, assign_roles
+from sharpfield.preparation.ingest.stage import Stage, as_json, fingerprint
+from sharpfield.preparation.ingest.survey import EventFilter, Survey, hot_pixels, survey_events
+from sharpfield.recordings.chunks import resolve_size
 from sharpfield.recordings.recording import Recording
 
 NEAR, FAR = 1.0, 100.0
-"""Stand-ins for the depth bounds of a scene that nobody has measured."""
+"""Placeholders for unknown depth bounds."""
 
-Progress = Callable[[str, int, int | None], None]
-"""Is told what is going on, how much of it is done, and how much there is, if that is known."""
+StepProgress = Callable[[str, int, int | None], None]
+"""Called with the name of a step, how much of it is done, and the total where it is known."""
 
 
 @dataclass(frozen=True)
-class Ingested:
-    """What became of a recording."""
+class IngestSummary:
+    """Result of an ingestion."""
 
     events: int
-    """Kept."""
+    """Number of events in the capture."""
     frames: int
     span_us: tuple[int, int]
+    """First and last time of the capture."""
     left_out: dict[str, int]
     """What was left out, by reason."""
     hot_pixels: int
     clock: str
-    """How frames came to the clock of the events."""
+    """How frame times were converted to the clock of the events; "" if they were not."""
     unknown: tuple[str, ...]
     """What is unknown yet: poses, intrinsics, depth bounds."""
 
 
 def ingest(
-    recordings: tuple[Recording, ...], out: Path, choices: IngestOptions, tell: Progress
-) -> Ingested:
-    """Make a capture of one recording, or of two that were taken together.
+    recordings: tuple[Recording, ...], out: Path, options: IngestOptions, progress: StepProgress
+) -> IngestSummary:
+    """Make a capture of one recording, or of two that were recorded together.
 
     Args:
-        recordings: One that has events, frames or both; or one that has events, and one that has
-            the frames.
+        recordings: One with events, frames or both; or one with events and one with frames.
         out: Folder of the capture.
-        choices: How.
-        tell: Is told of the progress.
+        options: All options.
+        progress: Called with the progress of each step.
 
     Raises:
-        CaptureError: A recording is unsound, or something is not known and must be given.
-        OptionError: Choices do not fit each other.
+        CaptureError: A recording is invalid, or something unknown must be given.
+        OptionError: Options contradict each other.
     """
-    events, frames = roles(recordings)
+    events, frames = assign_roles(recordings)
     plan = {
         "files": [fingerprint(recording.path) for recording in recordings],
         "layouts": [recording.layout for recording in recordings],
-        "choices": plain(choices),
+        "options": as_json(options),
     }
     stage = Stage(out, plan)
-    return _Ingest(events, frames, choices, stage, tell).run(out.name)
+    return _Ingest(events, frames, options, stage, progress).run(out.name)
 
 
 class _Ingest:
-    """One recording on its way; the steps in their order."""
+    """One ingestion; methods are its steps in their order."""
 
     def __init__(
         self,
         events: Recording | None,
         frames: Recording | None,
-        choices: IngestOptions,
+        options: IngestOptions,
         stage: Stage,
-        tell: Progress,
+        progress: StepProgress,
     ) -> None:
         self._events, self._frames = events, frames
-        self._choices, self._stage, self._tell = choices, stage, tell
-        self._left: dict[str, int] = {}
+        self._options, self._stage, self._progress = options, stage, progress
+        self._dropped: dict[str, int] = {}
+        """What the readers left out, by reason."""
         self._where = (events or frames or Recording(Path(), "")).path
 
-    def run(self, name: str) -> Ingested:
-        found = self._survey() if self._events is not None else None
-        lens = self._geometry()
-        taken = self._take(lens) if self._frames is not None else None
-        exposure, clock = self._exposure(taken, found) if taken is not None else (None, "")
-        span = self._span(found, exposure)
-        sieve = self._write_events(found, lens, span) if found is not None else None
-        left = self._left | ({} if sieve is None else sieve.left_out())
-        if taken is not None and exposure is not None:
-            taken, exposure, dropped = self._crop(taken, exposure, span)
-            left |= dropped
-        capture = self._capture(name, lens, taken, exposure, span)
-        self._seal(replace(capture, notes=self._notes(lens, sieve, left, clock)), taken)
-        return Ingested(
-            events=0
-            if found is None or sieve is None
-            else found.count - sum(sieve.left_out().values()),
-            frames=0 if taken is None else len(taken.names),
+    def run(self, name: str) -> IngestSummary:
+        survey = self._survey() if self._events is not None else None
+        geometry = self._geometry()
+        frames = self._write_frames(geometry) if self._frames is not None else None
+        exposure, clock = (None, "") if frames is None else self._exposure(frames, survey)
+        span = self._span(survey, exposure)
+        event_filter = None if survey is None else self._write_events(survey, geometry, span)
+        removed = {} if event_filter is None else event_filter.left_out()
+        left_out = self._dropped | removed
+        if frames is not None and exposure is not None:
+            frames, exposure, dropped = self._crop(frames, exposure, span)
+            left_out |= dropped
+        capture = self._capture(name, geometry, frames, exposure, span)
+        notes = self._notes(geometry, event_filter, left_out, clock)
+        self._finish(replace(capture, notes=notes), frames)
+        return IngestSummary(
+            events=0 if survey is None else survey.count - sum(removed.values()),
+            frames=0 if frames is None else len(frames.names),
             span_us=span,
-            left_out=left,
-            hot_pixels=0 if sieve is None else len(sieve.hot),
+            left_out=left_out,
+            hot_pixels=0 if event_filter is None else len(event_filter.hot),
             clock=clock,
             unknown=capture.known.unknown,
         )
 
     def _survey(self) -> Survey:
-        known = self._stage.load_frames()
-        if known is not None:
-            return known
+        """First pass over the events."""
+        saved = self._stage.load_survey()
+        if saved is not None:
+            return saved
         assert self._events is not None
-        if self._events.size is None:
-            raise CaptureError(
-                "the recording does not say the size of its sensor",
-                where=self._events.path,
-                do="give width and height in pixels",
-            )
-        found = survey(
+        survey = survey_events(
             self._events.chunks(),
-            self._events.size,
-            self._events.path,
-            lambda count: self._tell("looking through events", count, None),
+            resolve_size(self._events.size, None, self._where),
+            self._where,
+            lambda count: self._progress("counting events", count, None),
         )
-        if not found.count:
-            raise CaptureError("the recording holds no events", where=self._events.path)
-        self._stage.save_frames(found)
-        self._heed(self._events)
-        return found
+        if not survey.count:
+            raise CaptureError("the recording holds no events", where=self._where)
+        self._stage.save_survey(survey)
+        self._log_dropped(self._events)
+        return survey
 
-    def _geometry(self) -> Geometry:
+    def _geometry(self) -> CaptureGeometry:
         frame_size = None
         if self._frames is not None and self._frames.frames is not None:
             first = next(self._frames.frames(), None)
@@ -163,158 +164,154 @@ class _Ingest:
                 raise CaptureError("the recording holds no frames", where=self._frames.path)
             frame_size = first.image.shape[1], first.image.shape[0]
         sensor = None if self._events is None else self._events.size
-        return geometry(sensor, frame_size, self._choices.optics, self._where)
+        return capture_geometry(sensor, frame_size, self._options.optics, self._where)
 
-    def _take(self, lens: Geometry) -> WrittenFrames:
-        if self._stage.frames.is_file():
-            return load_frames(self._stage.frames)
+    def _write_frames(self, geometry: CaptureGeometry) -> WrittenFrames:
+        if self._stage.frames_record.is_file():
+            return load_frames(self._stage.frames_record)
         assert self._frames is not None and self._frames.frames is not None
-        taken = write_frames_of(
+        written = write_frames(
             self._frames.frames(),
             self._stage.capture / "frames",
-            lens,
+            geometry,
             self._bayer(self._frames),
-            lambda count: self._tell("writing frames", count, None),
+            lambda count: self._progress("writing frames", count, None),
         )
-        save_frames(taken, self._stage.frames)
-        self._heed(self._frames)
-        return taken
+        save_frames(written, self._stage.frames_record)
+        self._log_dropped(self._frames)
+        return written
 
     def _bayer(self, recording: Recording) -> str:
-        given = self._choices.scene.bayer
+        given = self._options.scene.bayer
         if given not in (None, "none", *DEMOSAIC):
             raise OptionError(
                 "unknown colour filter", got=given, do=f"use none, {', '.join(DEMOSAIC)}"
             )
         return recording.bayer if given is None else given.replace("none", "")
 
-    def _event_bayer(self, lens: Geometry) -> str:
-        """The filter before the event sensor; images of another sensor say nothing about it."""
-        assert self._events is not None
-        if self._choices.scene.bayer is None and lens.separate:
-            return ""
-        return self._bayer(self._events)
-
-    def _exposure(self, taken: WrittenFrames, found: Survey | None) -> tuple[Exposure, str]:
-        """When frames were exposed, on the clock of the events; and how that is known."""
-        timing = self._choices.timing
-        exposure = Exposure(taken.open_us, taken.close_us)
+    def _exposure(self, frames: WrittenFrames, survey: Survey | None) -> tuple[Exposure, str]:
+        """Exposures on the clock of the events, and how they were determined."""
+        timing = self._options.timing
+        exposure = Exposure(frames.open_us, frames.close_us)
         if timing.exposure is not None:
-            exposure = with_length(exposure, timing.exposure, timing.stamp)
+            exposure = with_exposure(exposure, timing.exposure, timing.stamp)
         if timing.offset_ms is not None:
             return shifted(exposure, round(1000 * timing.offset_ms)), (
-                f"frames are {timing.offset_ms} ms later than they say, as given"
+                f"frame times were shifted by {timing.offset_ms} ms, as given"
             )
-        apart = self._frames is not self._events and found is not None
-        if not apart or timing.clock == "same":
+        two_clocks = self._frames is not self._events and survey is not None
+        if not two_clocks or timing.clock == "same":
             return exposure, ""
-        assert found is not None and self._events is not None
+        assert survey is not None and self._events is not None
         if timing.clock != "find" and self._events.triggers is not None:
             triggers = self._events.triggers()
             if len(triggers.t_us):
-                pulses = triggered(
+                pulses = exposures_from_triggers(
                     triggers, len(exposure), channel=timing.trigger_channel, where=self._where
                 )
-                return pulses, "frames were exposed while the trigger was up"
+                return pulses, "frames were exposed while the trigger was high"
         if timing.clock == "triggers":
             raise CaptureError("the recording holds no triggers", where=self._where)
-        offset = find_offset(taken.change, exposure.middle_us, found.per_ms, found.origin_us)
-        return shifted(
-            exposure, accepted_offset(offset, self._where)
-        ), f"frames came later by {offset}"
+        offset = find_offset(
+            frames.change, exposure.middle_us, survey.events_per_ms, survey.origin_us
+        )
+        offset_us = accepted_offset(offset, self._where)
+        return shifted(exposure, offset_us), f"frame times were shifted by {offset}"
 
-    def _span(self, found: Survey | None, exposure: Exposure | None) -> tuple[int, int]:
+    def _span(self, survey: Survey | None, exposure: Exposure | None) -> tuple[int, int]:
         """First and last time of the capture."""
-        ends = [] if found is None else [(found.first_us, found.last_us)]
+        ends = [] if survey is None else [(survey.first_us, survey.last_us)]
         if exposure is not None:
             ends.append((int(exposure.open_us.min()), int(exposure.close_us.max())))
-        zero = ends[0][0]
+        origin = ends[0][0]
         first, last = min(begin for begin, _ in ends), max(end for _, end in ends)
-        crop = self._choices.crop
+        crop = self._options.crop
         if crop.start_ms is not None:
-            first = max(first, zero + round(1000 * crop.start_ms))
+            first = max(first, origin + round(1000 * crop.start_ms))
         if crop.end_ms is not None:
-            last = min(last, zero + round(1000 * crop.end_ms))
+            last = min(last, origin + round(1000 * crop.end_ms))
         if last <= first:
             raise OptionError(
-                "nothing was recorded in this time",
+                "nothing was recorded in this time range",
                 got=f"{crop.start_ms} to {crop.end_ms} ms after the first event",
             )
         return first, last
 
-    def _write_events(self, found: Survey, lens: Geometry, span: tuple[int, int]) -> Sieve:
-        """Write the events that are kept."""
+    def _write_events(
+        self, survey: Survey, geometry: CaptureGeometry, span: tuple[int, int]
+    ) -> EventFilter:
+        """Filter and write the events; returns the filter with its counts."""
         assert self._events is not None and self._events.size is not None
-        cleaning = self._choices.cleaning
-        sieve = Sieve(
-            hot_pixels(found.per_pixel, cleaning.hot),
-            round(1000 * cleaning.lonely_ms),
+        cleaning = self._options.cleaning
+        event_filter = EventFilter(
+            hot_pixels(survey.events_per_pixel, cleaning.hot),
+            round(1000 * cleaning.isolated_ms),
             span,
             self._events.size,
         )
-        if self._stage.events.is_file():
-            told = json.loads(self._stage.events.read_text())
-            sieve.of_hot, sieve.lonely, sieve.outside = told["sifted"]
-            self._left |= told["left_out"]
+        if self._stage.events_record.is_file():
+            record = json.loads(self._stage.events_record.read_text())
+            event_filter.load_counts(record["removed"])
+            self._dropped |= record["dropped"]
         else:
-            bayer = self._event_bayer(lens)
+            # The colour filter of a separate frame camera is not that of the event sensor.
+            unknown = geometry.separate_sensors and self._options.scene.bayer is None
+            bayer = "" if unknown else self._bayer(self._events)
+            chunks = (event_filter.filtered(chunk) for chunk in self._event_chunks(survey.count))
             self._stage.write(
-                (lens.placed(sieve.sifted(chunk), bayer) for chunk in self._told(found.count)),
-                lens.placed(no_events(self._events.size), bayer),
+                (geometry.mapped_events(chunk, bayer) for chunk in chunks),
+                geometry.mapped_events(empty_stream(self._events.size), bayer),
                 span,
             )
-            self._heed(self._events)
-            told = {
-                "sifted": [sieve.of_hot, sieve.lonely, sieve.outside],
-                "left_out": self._left,
-            }
-            write_json(self._stage.events, told)
+            self._log_dropped(self._events)
+            record = {"removed": event_filter.counts(), "dropped": self._dropped}
+            write_json(self._stage.events_record, record)
         self._stage.join()
-        return sieve
+        return event_filter
 
-    def _told(self, count: int) -> Iterator[EventStream]:
-        """All events, while the progress is told."""
+    def _event_chunks(self, count: int) -> Iterator[EventStream]:
+        """All events; reports the progress."""
         assert self._events is not None
         done = 0
         for chunk in self._events.chunks():
             yield chunk
             done += len(chunk)
-            self._tell("writing events", done, count)
+            self._progress("writing events", done, count)
 
-    def _heed(self, recording: Recording) -> None:
-        """Keep what a pass through a recording left out; each pass meets the same."""
+    def _log_dropped(self, recording: Recording) -> None:
+        """Keep the counts of what a reader left out; each pass over a recording finds the same."""
         for kind, count in recording.log.counts.items():
-            self._left[kind] = max(self._left.get(kind, 0), count)
+            self._dropped[kind] = max(self._dropped.get(kind, 0), count)
 
     def _crop(
-        self, taken: WrittenFrames, exposure: Exposure, span: tuple[int, int]
+        self, frames: WrittenFrames, exposure: Exposure, span: tuple[int, int]
     ) -> tuple[WrittenFrames, Exposure, dict[str, int]]:
-        """The frames whose exposures lie in the time to keep, and while the poses are known."""
+        """Frames with exposures inside the time range and the poses, and counts of the others."""
         inside = (exposure.open_us >= span[0]) & (exposure.close_us <= span[1])
         posed = np.ones(len(exposure), bool)
-        if self._choices.scene.poses is not None:
-            times_us, _ = read_poses(self._choices.scene.poses)
+        if self._options.scene.poses is not None:
+            times_us, _ = read_poses(self._options.scene.poses)
             posed = (exposure.open_us >= times_us[0] - HELD_BACK_US) & (
                 exposure.close_us <= times_us[-1] + HELD_BACK_US
             )
         keep = inside & posed
         if not keep.any():
             raise CaptureError(
-                "no frame was taken while the poses are known"
+                "no frame was exposed within the time of the poses"
                 if inside.any()
-                else "no frame was taken in this time",
+                else "no frame was exposed in this time range",
                 where=self._where,
                 got=f"frames from {exposure.open_us.min()} to {exposure.close_us.max()} us",
                 do="check that both count from the same instant, and the units",
             )
-        for name in np.array(taken.names)[~keep]:
+        for name in np.array(frames.names)[~keep]:
             (self._stage.capture / "frames" / f"{name}.png").unlink(missing_ok=True)
         dropped = {
-            "frames outside the time to keep": int((~inside).sum()),
+            "frames outside the time range": int((~inside).sum()),
             "frames without poses": int((inside & ~posed).sum()),
         }
         return (
-            taken.picked(keep),
+            frames.selected(keep),
             Exposure(exposure.open_us[keep], exposure.close_us[keep]),
             {kind: count for kind, count in dropped.items() if count},
         )
@@ -322,27 +319,28 @@ class _Ingest:
     def _capture(
         self,
         name: str,
-        lens: Geometry,
-        taken: WrittenFrames | None,
+        geometry: CaptureGeometry,
+        written: WrittenFrames | None,
         exposure: Exposure | None,
         span: tuple[int, int],
     ) -> Capture:
         clock = Clock(span[0], max(span[1] - span[0], 1))
-        scene = self._choices.scene
+        scene = self._options.scene
         frames = None
-        if taken is not None and exposure is not None:
-            blank = np.zeros((), f"uint{taken.bits}")
+        if written is not None and exposure is not None and self._frames is not None:
+            raw = "linear" if self._bayer(self._frames) else "gamma2.2"
+            blank = np.zeros((), f"uint{written.bits}")
             frames = Frames(
-                # What is checked of frames is all but their pixels, which are on disk already.
-                np.broadcast_to(blank, (len(taken.names), *taken.shape)),
+                # Placeholder pixels: the images are on disk already.
+                np.broadcast_to(blank, (len(written.names), *written.shape)),
                 exposure,
-                np.zeros(len(taken.names), np.int64),
-                taken.names,
-                scene.encoding or self._encoding(),
+                np.zeros(len(written.names), np.int64),
+                written.names,
+                scene.encoding or self._frames.frame_encoding or raw,
             )
-        events = None if self._events is None else no_events(self._events.size or (1, 1))
+        events = None if self._events is None else empty_stream(self._events.size or (1, 1))
         return Capture(
-            camera=lens.camera,
+            camera=geometry.camera,
             trajectory=self._trajectory(clock),
             clock=clock,
             near=scene.near or NEAR,
@@ -351,46 +349,45 @@ class _Ingest:
             events=events,
             split=Split(np.arange(0 if frames is None else len(frames)), np.zeros(0, np.int64)),
             name=name,
-            known=self._known(lens),
+            known=self._known(geometry),
             source=" and ".join(dict.fromkeys(r.layout for r in (self._events, self._frames) if r)),
         )
 
-    def _encoding(self) -> str:
-        assert self._frames is not None
-        raw = self._bayer(self._frames)
-        return self._frames.frame_encoding or ("linear" if raw else "gamma2.2")
-
     def _trajectory(self, clock: Clock) -> Trajectory:
-        if self._choices.scene.poses is None:
+        if self._options.scene.poses is None:
             return Still(np.eye(3, 4)[None])
-        times_us, poses = read_poses(self._choices.scene.poses)
+        times_us, poses = read_poses(self._options.scene.poses)
         return Stamped(times_us, poses, clock)
 
     def _notes(
-        self, lens: Geometry, sieve: Sieve | None, left: dict[str, int], clock: str
+        self,
+        geometry: CaptureGeometry,
+        event_filter: EventFilter | None,
+        left_out: dict[str, int],
+        clock: str,
     ) -> dict[str, Note]:
-        notes: dict[str, Note] = {**lens.notes} | ({"clock": clock} if clock else {})
-        if left:
-            notes["left_out"] = ", ".join(f"{count} {kind}" for kind, count in left.items())
-        if sieve is not None and len(sieve.hot):
-            notes["hot_pixels"] = sieve.hot
+        notes: dict[str, Note] = {**geometry.notes} | ({"clock": clock} if clock else {})
+        if left_out:
+            notes["left_out"] = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
+        if event_filter is not None and len(event_filter.hot):
+            notes["hot_pixels"] = event_filter.hot
         return notes
 
-    def _known(self, lens: Geometry) -> Known:
-        scene = self._choices.scene
+    def _known(self, geometry: CaptureGeometry) -> Known:
+        scene = self._options.scene
         return Known(
             poses="unknown" if scene.poses is None else "known",
-            intrinsics=lens.intrinsics,
+            intrinsics=geometry.intrinsics,
             bounds="unknown" if None in (scene.near, scene.far) else "known",
             thresholds=None if self._events is None else self._events.thresholds,
         )
 
-    def _seal(self, capture: Capture, taken: WrittenFrames | None) -> None:
-        """Write the description, and let the capture take its place."""
+    def _finish(self, capture: Capture, frames: WrittenFrames | None) -> None:
+        """Write the description, and move the capture to its final path."""
         tables = None
-        if taken is not None and capture.frames is not None:
+        if frames is not None and capture.frames is not None:
             exposure = capture.frames.exposure
-            shutter = zip(taken.names, exposure.open_us, exposure.close_us, strict=True)
+            shutter = zip(frames.names, exposure.open_us, exposure.close_us, strict=True)
             tables = [
                 {"name": name, "open_us": int(begin), "close_us": int(end), "use": "train"}
                 for name, begin, end in shutter

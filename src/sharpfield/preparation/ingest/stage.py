@@ -1,15 +1,15 @@
-"""Where a capture grows while a recording is ingested: interrupt it, and it goes on from there.
+"""Staging folder of an ingestion, from which an interrupted one continues.
 
-Beside the capture to be, a hidden folder `.NAME-ingest/` holds
+Beside the capture, a hidden folder `.NAME-ingest/` holds
 
-    plan.json       which files are ingested, and how; another plan starts anew
-    survey.npz      what the first look at the events found
-    frames.json     which frames were written, once all were
-    events.json     what became of the events, once all were written
-    part-000.h5     events, so many in each part
-    capture/        what becomes the capture
+    plan.json       input files and options; with another plan, everything starts over
+    survey.npz      result of the first pass over the events
+    frames.json     record of the frames, after the last one was written
+    events.json     counts of the events, after the last one was written
+    part-000.h5     events, a fixed number in each part
+    capture/        the capture in the making
 
-Each file appears whole or not at all, and the capture appears when all is there.
+Each file appears complete or not at all, and the capture appears when all of it is there.
 """
 
 import dataclasses
@@ -31,66 +31,67 @@ from sharpfield.storage.arrays import expect_replaceable, load_arrays, write_arr
 from sharpfield.storage.event_writer import ROWS, join_events, writing_events
 
 PART = 512 * ROWS
-"""Events in a part: as many as may have to be written again, about a second's work."""
+"""Events in a part; so many may have to be written again, about a second of work."""
 
 PLAN = "plan.json"
 
 
 class Stage:
-    """The folder in which a capture grows.
+    """The staging folder.
 
     Args:
-        out: Where the capture will be.
-        plan: Of what it is made, ready for JSON.
+        out: Final path of the capture.
+        plan: Input files and options, as JSON values.
+        part: Events in a part.
 
     Raises:
-        CaptureError: Something that is not a capture is at `out`.
+        CaptureError: `out` exists and is no capture, or the staging folder is not ours.
     """
 
     def __init__(self, out: Path, plan: dict[str, Any], *, part: int = PART) -> None:
         expect_replaceable(out, native.recognise)
         self._out, self._part = out, part
         self.folder = out.resolve().parent / f".{out.resolve().name}-ingest"
-        told = self.folder / PLAN
-        self.resumed = told.is_file() and told.read_text() == json.dumps(plan)
+        plan_file = self.folder / PLAN
+        self.resumed = plan_file.is_file() and plan_file.read_text() == json.dumps(plan)
         if not self.resumed:
             self._expect_own()
             shutil.rmtree(self.folder, ignore_errors=True)
             self.capture.mkdir(parents=True)
-            with replacing(told) as temporary:
+            with replacing(plan_file) as temporary:
                 temporary.write_text(json.dumps(plan))
 
     @property
     def capture(self) -> Path:
-        """What becomes the capture."""
+        """Folder of the capture in the making."""
         return self.folder / "capture"
 
     @property
-    def frames(self) -> Path:
-        """Where it is told which frames were written."""
+    def frames_record(self) -> Path:
+        """File with the record of the frames."""
         return self.folder / "frames.json"
 
     @property
-    def events(self) -> Path:
-        """Where it is told what became of the events."""
+    def events_record(self) -> Path:
+        """File with the counts of the events."""
         return self.folder / "events.json"
 
-    def save_frames(self, survey: Survey) -> None:
-        """Keep the first look."""
+    def save_survey(self, survey: Survey) -> None:
+        """Save the result of the first pass."""
         with replacing(self.folder / "survey.npz") as temporary:
             write_arrays(
                 temporary,
                 {name: np.asarray(value) for name, value in vars(survey).items()},
             )
 
-    def load_frames(self) -> Survey | None:
-        """The first look, if there was one."""
+    def load_survey(self) -> Survey | None:
+        """Result of the first pass; None if there was none."""
         path = self.folder / "survey.npz"
         if not path.is_file():
             return None
-        found = load_arrays(path)
-        count, first_us, last_us = (int(found[name]) for name in ("count", "first_us", "last_us"))
-        return Survey(count, first_us, last_us, found["per_pixel"], found["per_ms"])
+        arrays = load_arrays(path)
+        count, first_us, last_us = (int(arrays[name]) for name in ("count", "first_us", "last_us"))
+        return Survey(count, first_us, last_us, arrays["events_per_pixel"], arrays["events_per_ms"])
 
     def write(
         self, parts: Iterator[EventStream], like: EventStream, span_us: tuple[int, int]
@@ -100,29 +101,29 @@ class Stage:
         Args:
             parts: All events of the capture, from the first one.
             like: A stream of the same sensor.
-            span_us: Of the capture.
+            span_us: First and last time of the capture.
         """
         written = self._parts()
         done = sum(_count(path) for path in written)
-        pieces = _cut(_after(parts, done), self._part)
+        slices = _cut(_skip(parts, done), self._part)
         number = len(written)
-        piece, full = next(pieces, (like, True))
-        while number == len(written) or len(piece):
+        events, full = next(slices, (like, True))
+        while number == len(written) or len(events):
             with writing_events(
                 self.folder / f"part-{number:03d}.h5",
                 like,
                 span_us=span_us[1] - span_us[0] + 1000,
                 origin_us=span_us[0] // 1000 * 1000,
             ) as writer:
-                writer.append(piece)
+                writer.append(events)
                 while not full:
-                    piece, full = next(pieces, (like, True))
-                    writer.append(piece)
+                    events, full = next(slices, (like, True))
+                    writer.append(events)
             number += 1
-            piece, full = next(pieces, (like, True))
+            events, full = next(slices, (like, True))
 
     def join(self) -> None:
-        """Make one file of the parts."""
+        """Join the parts to one event file."""
         parts = self._parts()
         if len(parts) > 1 and not _count(parts[-1]):
             parts.pop().unlink()
@@ -134,7 +135,7 @@ class Stage:
                 part.unlink()
 
     def finish(self) -> None:
-        """Let the capture take its place."""
+        """Move the capture to its final path."""
         old = self.folder / "replaced"
         if self._out.exists():
             self._out.rename(old)
@@ -147,22 +148,22 @@ class Stage:
     def _expect_own(self) -> None:
         if self.folder.exists() and not (self.folder / PLAN).is_file():
             raise CaptureError(
-                "the place where the capture should grow is taken",
+                "the staging folder exists and is not one of ours",
                 where=self.folder,
                 do="move that folder away",
             )
 
 
 def fingerprint(path: Path) -> list[Any]:
-    """Changes when a file, or one of a folder's, is written again."""
+    """Path, number of files, bytes and time of the last change of a file or folder."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    about = [file.stat() for file in files if file.is_file()]
-    newest = max((entry.st_mtime_ns for entry in about), default=0)
-    return [str(path.resolve()), len(about), sum(entry.st_size for entry in about), newest]
+    entries = [file.stat() for file in files if file.is_file()]
+    newest = max((entry.st_mtime_ns for entry in entries), default=0)
+    return [str(path.resolve()), len(entries), sum(entry.st_size for entry in entries), newest]
 
 
-def plain(options: Any) -> Any:
-    """A frozen dataclass of options as JSON has it."""
+def as_json(options: Any) -> Any:
+    """A frozen dataclass of options as JSON values."""
     return json.loads(json.dumps(dataclasses.asdict(options), default=str))
 
 
@@ -172,8 +173,8 @@ def _count(path: Path) -> int:
         return len(times)
 
 
-def _after(parts: Iterator[EventStream], done: int) -> Iterator[EventStream]:
-    """The events that come after the first so many."""
+def _skip(parts: Iterator[EventStream], done: int) -> Iterator[EventStream]:
+    """Skip the first `done` events."""
     for part in parts:
         skipped = min(done, len(part))
         done -= skipped
@@ -182,12 +183,12 @@ def _after(parts: Iterator[EventStream], done: int) -> Iterator[EventStream]:
 
 
 def _cut(parts: Iterator[EventStream], each: int) -> Iterator[tuple[EventStream, bool]]:
-    """Pieces, and whether one makes so many full."""
+    """Slices of at most `each` events, and whether a slice completes a part."""
     room = each
     for part in parts:
         first = 0
         while first < len(part):
-            piece = part[first : first + room]
-            first, room = first + len(piece), room - len(piece)
-            yield piece, not room
+            events = part[first : first + room]
+            first, room = first + len(events), room - len(events)
+            yield events, not room
             room = room or each

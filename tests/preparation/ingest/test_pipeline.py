@@ -16,7 +16,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
-from sharpfield.preparation.ingest.pipeline import Ingested, ingest
+from sharpfield.preparation.ingest.pipeline import IngestSummary, ingest
 from sharpfield.preparation.ingest.stage import Stage
 from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import open_recording
@@ -117,15 +117,15 @@ CONTAINERS: dict[str, tuple[Callable[[Path, EventStream], None], ReaderOptions]]
 
 
 def ingested(
-    truth: Capture, folder: Path, choices: IngestOptions = SAME, container: str = "events.h5"
-) -> tuple[Ingested, Path]:
+    truth: Capture, folder: Path, options: IngestOptions = SAME, container: str = "events.h5"
+) -> tuple[IngestSummary, Path]:
     write, told = CONTAINERS[container]
     write(folder / container, truth.needed_events)
     recordings = (
         open_recording(folder / container, told),
         open_recording(write_images(truth, folder)),
     )
-    return ingest(recordings, folder / "capture", choices, hush), folder / "capture"
+    return ingest(recordings, folder / "capture", options, hush), folder / "capture"
 
 
 def of_arrays(
@@ -217,7 +217,7 @@ class Unplugged(Exception):
     """What ends a recording early, in these tests."""
 
 
-@pytest.mark.parametrize("after", ["looking through events", "writing frames", "writing events"])
+@pytest.mark.parametrize("after", ["counting events", "writing frames", "writing events"])
 def test_what_was_interrupted_goes_on(truth, tmp_path, monkeypatch, after):
     def unplug(doing: str, done: int, total: int | None) -> None:
         if doing == after and done > 5:
@@ -276,7 +276,7 @@ def test_another_plan_starts_anew(tmp_path):
     (first.folder / "frames.json").write_text("{}")
     again = Stage(tmp_path / "capture", {"files": 2})
     assert not again.resumed
-    assert not again.frames.exists()
+    assert not again.frames_record.exists()
 
 
 def test_what_is_not_a_capture_is_not_replaced(truth, tmp_path):
@@ -300,18 +300,16 @@ def in_memory(truth: Capture, shift_us: int = 0) -> list[Frame]:
 
 def test_a_part_of_the_time(truth, tmp_path):
     start = int(truth.needed_events.t_us[0])
-    choices = replace(SAME, crop=Crop(30.0, 110.0))
-    made, folder = ingested(truth, tmp_path, choices)
+    options = replace(SAME, crop=Crop(30.0, 110.0))
+    made, folder = ingested(truth, tmp_path, options)
     found = native.read_unposed(folder)
     wanted = truth.needed_events.window(start + 30_000, start + 110_001)
     np.testing.assert_array_equal(found.needed_events.t_us, wanted.t_us)
     assert found.clock.span_us == 80_000
-    assert made.left_out["events outside the time to keep"] == len(truth.needed_events) - len(
-        wanted
-    )
-    assert made.left_out["frames outside the time to keep"] == 8 - made.frames
+    assert made.left_out["events outside the time range"] == len(truth.needed_events) - len(wanted)
+    assert made.left_out["frames outside the time range"] == 8 - made.frames
     assert len(list((folder / "frames").iterdir())) == made.frames == len(found.needed_frames)
-    with pytest.raises(OptionError, match="nothing was recorded in this time"):
+    with pytest.raises(OptionError, match="nothing was recorded in this time range"):
         ingested(truth, tmp_path, replace(SAME, crop=Crop(5e6, None)))
 
 
@@ -320,21 +318,21 @@ def test_triggers_say_when_frames_were_exposed(truth, tmp_path):
     edges = np.stack([exposure.open_us, exposure.close_us], -1).ravel()
     triggers = Triggers(edges, np.tile(np.array([1, -1], np.int8), 8), np.zeros(16, np.uint8))
     late = [replace(frame, close_us=frame.open_us) for frame in in_memory(truth, 123_456)]
-    choices = IngestOptions(scene=SAME.scene)
+    options = IngestOptions(scene=SAME.scene)
     out = tmp_path / "capture"
-    made = ingest(of_arrays(truth.needed_events, late, triggers), out, choices, hush)
+    made = ingest(of_arrays(truth.needed_events, late, triggers), out, options, hush)
     found = native.read_unposed(out).needed_frames.exposure
     np.testing.assert_array_equal(found.open_us, exposure.open_us)
     np.testing.assert_array_equal(found.close_us, exposure.close_us)
     assert "trigger" in made.clock
     with pytest.raises(CaptureError, match="one pulse on the trigger for each frame"):
-        ingest(of_arrays(truth.needed_events, late[:5], triggers), tmp_path / "o", choices, hush)
+        ingest(of_arrays(truth.needed_events, late[:5], triggers), tmp_path / "o", options, hush)
 
 
 def test_an_offset_that_is_given_is_taken(truth, tmp_path):
-    choices = IngestOptions(timing=Timing(offset_ms=-50.0), scene=SAME.scene)
+    options = IngestOptions(timing=Timing(offset_ms=-50.0), scene=SAME.scene)
     frames = in_memory(truth, 50_000)
-    ingest(of_arrays(truth.needed_events, frames), tmp_path / "capture", choices, hush)
+    ingest(of_arrays(truth.needed_events, frames), tmp_path / "capture", options, hush)
     found = native.read_unposed(tmp_path / "capture").needed_frames.exposure
     np.testing.assert_array_equal(found.open_us, truth.needed_frames.exposure.open_us)
 

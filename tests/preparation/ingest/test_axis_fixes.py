@@ -16,13 +16,13 @@ from tests.recordings.captured import expect_equal_events
 from tests.streams import HEIGHT, WIDTH, random_events
 
 
-def spoiled(events: EventStream, mistakes: AxisFixes) -> EventStream:
-    """What a program with these mistakes would have written."""
+def spoiled(events: EventStream, fixes: AxisFixes) -> EventStream:
+    """What a program with these fixes would have written."""
     x, y, width, height = events.x, events.y, events.width, events.height
-    x = width - 1 - x if mistakes.flip_x else x
-    y = height - 1 - y if mistakes.flip_y else y
-    p = -events.p if mistakes.flip_polarity else events.p
-    if mistakes.swap_xy:
+    x = width - 1 - x if fixes.flip_x else x
+    y = height - 1 - y if fixes.flip_y else y
+    p = -events.p if fixes.flip_polarity else events.p
+    if fixes.swap_xy:
         x, y, width, height = y, x, height, width
     return replace(
         events,
@@ -37,24 +37,24 @@ def spoiled(events: EventStream, mistakes: AxisFixes) -> EventStream:
 ALL = [AxisFixes(*parts) for parts in product((False, True), repeat=4)]
 
 
-@pytest.mark.parametrize("mistakes", ALL, ids=str)
-def test_each_mixture_of_mistakes_is_undone(mistakes: AxisFixes) -> None:
+@pytest.mark.parametrize("fixes", ALL, ids=str)
+def test_each_mixture_of_fixes_is_undone(fixes: AxisFixes) -> None:
     true = random_events(500)
-    wrong = spoiled(true, mistakes)
+    wrong = spoiled(true, fixes)
     size = (wrong.width, wrong.height)
     recording = Recording(
         Path("x"), "made up", size, events=lambda: iter([wrong[:200], wrong[200:]])
     )
-    found = fixed_axes(recording, mistakes)
+    found = fixed_axes(recording, fixes)
     assert found.size == (WIDTH, HEIGHT)
     expect_equal_events(found.load(), true)
-    assert (found.layout == "made up") == (mistakes == AxisFixes())
+    assert (found.layout == "made up") == (fixes == AxisFixes())
 
 
-def test_options_of_ingest_undo_mistakes_of_a_text(tmp_path: Path) -> None:
+def test_options_of_ingest_undo_fixes_of_a_text(tmp_path: Path) -> None:
     true = random_events(500)
-    mistakes = AxisFixes(swap_xy=True, flip_y=True, flip_polarity=True)
-    wrong = spoiled(true, mistakes)
+    fixes = AxisFixes(swap_xy=True, flip_y=True, flip_polarity=True)
+    wrong = spoiled(true, fixes)
     table = np.column_stack([wrong.t_us, wrong.x, wrong.y, wrong.p > 0])
     np.savetxt(tmp_path / "events.txt", table, "%d")
     words = ("--unit", "us", "--size", f"{WIDTH}x{HEIGHT}", "--hot", 0)
