@@ -219,7 +219,7 @@ def test_a_run_gives_its_gaussians_and_a_video_away(run: sf.Run, tmp_path: Path)
     count = run.export(tmp_path / "scene.ply")
     assert count == len(run.model.scene.gaussians)
     assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply")
-    assert run.video(tmp_path / "images", images=2) == 2
+    assert run.video(tmp_path / "images", frames=2) == 2
     assert len(list((tmp_path / "images").glob("*.png"))) == 2
     with pytest.raises(sf.SharpfieldError, match="exported as .ply"):
         run.export(tmp_path / "scene.obj")

@@ -200,7 +200,7 @@ class Run:
         out: Path | str,
         *,
         path: str = "spiral",
-        images: int = 60,
+        frames: int = 60,
         fps: float | int = 30,
         console: Console | None = None,
     ) -> int:
@@ -209,7 +209,7 @@ class Run:
         Args:
             out: A video FILE.mp4, or a folder for PNG files.
             path: spiral, train, or exposure:N for the inside of the exposure of frame N.
-            images: How many.
+            frames: How many images.
             fps: Frames per second of the video.
             console: Where progress is shown.
 
@@ -220,7 +220,7 @@ class Run:
             OptionError: There is no such path.
         """
         model, console = self.model, console or Console()
-        moves = camera_path(self.seen, path, images=images)
+        moves = camera_path(self.seen, path, images=frames)
 
         def rendered(number: int) -> UInt8[np.ndarray, "h w c"]:
             pose = torch.from_numpy(moves.poses[number]).to(device_of(model))
