@@ -5,13 +5,13 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.plugins import PluginWarning
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import (
     FORMATS,
     format_of,
     open_events,
     open_recording,
 )
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.images import write_image
 from tests.streams import HEIGHT, WIDTH, random_events
@@ -125,7 +125,7 @@ def test_what_does_not_belong_to_the_format(tmp_path):
 
 def test_another_package_adds_a_format_and_a_broken_one_is_only_a_warning(tmp_path, monkeypatch):
     (tmp_path / "their_camera.py").write_text(
-        "from sharpfield.recordings.format import Format, begins_with\n"
+        "from sharpfield.recordings.recording import Format, begins_with\n"
         "from sharpfield.recordings.tables.text import open_text\n"
         "FORMAT = Format('their-camera', open_text, 'events', '`#THEIRS`',"
         " recognise=begins_with(b'#THEIRS'), options=('size', 'unit'))\n"

@@ -7,9 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import FORMATS, open_recording
-from sharpfield.recordings.recording import ReadLog, Recording
+from sharpfield.recordings.recording import ReaderOptions, ReadLog, Recording
 from sharpfield.storage.images import write_image
 from tests.recordings import fuzz
 from tests.recordings.aedat import test_aedat2, test_aedat3, test_aedat4

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.video import open_images, open_video
 from sharpfield.storage.images import write_image
 from tests.recordings import fuzz

@@ -33,9 +33,8 @@ from sharpfield.preparation.ingest.options import (
 )
 from sharpfield.preparation.ingest.pipeline import IngestSummary, StepProgress
 from sharpfield.preparation.ingest.pipeline import ingest as ingest_recordings
-from sharpfield.recordings.format import Format, ReaderOptions
 from sharpfield.recordings.open import format_named, format_of, open_recording
-from sharpfield.recordings.recording import Recording
+from sharpfield.recordings.recording import Format, ReaderOptions, Recording
 
 FRAMES_ONLY = ("video", "images")
 """Formats that hold no events."""

@@ -9,31 +9,29 @@ from pathlib import Path
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.plugins import Registry
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
-from sharpfield.recordings.recording import Recording
+from sharpfield.recordings.recording import NO_OPTIONS, Format, ReaderOptions, Recording
 
 HEAD_BYTES = 4096
 """Number of bytes by which a file is recognised."""
 
-_ROOM = "sharpfield.recordings"
 FORMATS = Registry(
     "sharpfield.formats",
     {
-        "evt": f"{_ROOM}.prophesee.evt:FORMAT",
-        "dat": f"{_ROOM}.prophesee.dat:FORMAT",
-        "aedat2": f"{_ROOM}.aedat.aedat2:FORMAT",
-        "aedat3": f"{_ROOM}.aedat.aedat3:FORMAT",
-        "aedat4": f"{_ROOM}.aedat.aedat4:FORMAT",
-        "rosbag": f"{_ROOM}.ros.recording:FORMAT",
-        "nmnist": f"{_ROOM}.tables.npz:NMNIST",
-        "text": f"{_ROOM}.tables.text:FORMAT",
-        "rpg-folder": f"{_ROOM}.tables.text:RPG_FOLDER",
-        "hdf5": f"{_ROOM}.tables.hdf5:FORMAT",
-        "npz": f"{_ROOM}.tables.npz:NPZ",
-        "npz-folder": f"{_ROOM}.tables.npz:NPZ_FOLDER",
-        "npy": f"{_ROOM}.tables.npz:NPY",
-        "video": f"{_ROOM}.video:VIDEO",
-        "images": f"{_ROOM}.video:IMAGES",
+        "evt": "sharpfield.recordings.prophesee.evt:FORMAT",
+        "dat": "sharpfield.recordings.prophesee.dat:FORMAT",
+        "aedat2": "sharpfield.recordings.aedat.aedat2:FORMAT",
+        "aedat3": "sharpfield.recordings.aedat.aedat3:FORMAT",
+        "aedat4": "sharpfield.recordings.aedat.aedat4:FORMAT",
+        "rosbag": "sharpfield.recordings.ros.recording:FORMAT",
+        "nmnist": "sharpfield.recordings.tables.npz:NMNIST",
+        "text": "sharpfield.recordings.tables.text:FORMAT",
+        "rpg-folder": "sharpfield.recordings.tables.text:RPG_FOLDER",
+        "hdf5": "sharpfield.recordings.tables.hdf5:FORMAT",
+        "npz": "sharpfield.recordings.tables.npz:NPZ",
+        "npz-folder": "sharpfield.recordings.tables.npz:NPZ_FOLDER",
+        "npy": "sharpfield.recordings.tables.npz:NPY",
+        "video": "sharpfield.recordings.video:VIDEO",
+        "images": "sharpfield.recordings.video:IMAGES",
     },
 )
 """Every file format, by name; each reader is imported when it is first asked for."""

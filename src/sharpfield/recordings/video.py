@@ -25,8 +25,14 @@ from av.error import FFmpegError
 from jaxtyping import Int64, Shaped
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
-from sharpfield.recordings.recording import Frame, ReadLog, Recording
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Format,
+    Frame,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+)
 from sharpfield.storage.arrays import load_arrays
 from sharpfield.storage.event_columns import UNITS, known_unit, whole_us
 from sharpfield.storage.images import list_images, read_image

@@ -18,9 +18,8 @@ from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
 from sharpfield.preparation.ingest.pipeline import IngestSummary, ingest
 from sharpfield.preparation.ingest.stage import Stage
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import open_recording
-from sharpfield.recordings.recording import Frame, Recording, Triggers
+from sharpfield.recordings.recording import Frame, ReaderOptions, Recording, Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, simulate
 from sharpfield.simulation.static_capture import Timing as Exposures

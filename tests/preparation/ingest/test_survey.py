@@ -61,8 +61,8 @@ def test_an_edge_is_not_hot():
 
 
 def test_simulated_scenes_have_no_hot_pixels(samples):
-    from sharpfield.recordings.format import ReaderOptions
     from sharpfield.recordings.open import open_recording
+    from sharpfield.recordings.recording import ReaderOptions
 
     told = ReaderOptions(unit="ns", size=(300, 200))
     recording = open_recording(samples / "blender" / "atelier" / "events.h5", told)

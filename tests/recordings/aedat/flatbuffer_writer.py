@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sharpfield.recordings.aedat.flatbuffers import PREFIX
+from sharpfield.recordings.aedat.aedat4 import PREFIX
 
 
 @dataclass(frozen=True)

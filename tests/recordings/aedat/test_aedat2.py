@@ -8,7 +8,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat2 import open_aedat2
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from tests.recordings import fuzz
 from tests.recordings.captured import expect_equal_events
 

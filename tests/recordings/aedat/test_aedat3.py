@@ -7,7 +7,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat3 import open_aedat3
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from tests.recordings import fuzz
 from tests.recordings.aedat.test_aedat2 import rows, some_events
 from tests.recordings.captured import expect_equal_events

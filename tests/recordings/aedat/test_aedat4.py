@@ -10,8 +10,7 @@ import pytest
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.recordings.aedat.aedat4 import open_aedat4
-from sharpfield.recordings.format import ReaderOptions
-from sharpfield.recordings.recording import Frame, Recording
+from sharpfield.recordings.recording import Frame, ReaderOptions, Recording
 from tests.recordings import fuzz
 from tests.recordings.aedat.aedat4_writer import write_aedat4
 from tests.recordings.aedat.flatbuffer_writer import Scalar, Vector, packed

@@ -2,7 +2,7 @@ import struct
 
 import pytest
 
-from sharpfield.recordings.aedat.flatbuffers import root
+from sharpfield.recordings.aedat.aedat4 import root
 from sharpfield.recordings.bytes import DamagedData
 from tests.recordings.aedat.flatbuffer_writer import Scalar, Tables, Vector, packed
 

@@ -5,9 +5,9 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.prophesee import dat
 from sharpfield.recordings.prophesee.dat import open_dat
+from sharpfield.recordings.recording import ReaderOptions
 from tests.recordings import fuzz
 
 HEADER = "% Data file containing CD events\n% Version 2\n% Width 640\n% Height 480\n"

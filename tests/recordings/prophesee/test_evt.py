@@ -5,10 +5,9 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import format_of
 from sharpfield.recordings.prophesee.evt import decode_chunks, decode_triggers, open_evt
-from sharpfield.recordings.recording import ReadLog
+from sharpfield.recordings.recording import ReaderOptions, ReadLog
 from sharpfield.storage.evt_writer import writing_evt
 from tests.recordings import fuzz
 from tests.streams import random_events

@@ -9,8 +9,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.recordings.format import ReaderOptions
-from sharpfield.recordings.recording import Frame, Recording
+from sharpfield.recordings.recording import Frame, ReaderOptions, Recording
 from sharpfield.recordings.ros.recording import open_rosbag
 from tests.recordings import fuzz
 from tests.recordings.bags import ARRAY, COMPRESSED, IMAGE, PACKET, Ros, parts

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables.hdf5 import open_hdf5
 from sharpfield.storage.event_writer import write_events
 from tests.recordings import fuzz

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables.npz import SIZES, open_nmnist
 from tests.recordings import fuzz
 

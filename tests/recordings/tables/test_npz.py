@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.format import ReaderOptions
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables import npz
 from sharpfield.recordings.tables.npz import open_npy, open_npz, open_npz_folder
 from sharpfield.storage.event_formats import exporting_events

@@ -7,8 +7,8 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
-from sharpfield.recordings.format import ReaderOptions
 from sharpfield.recordings.open import format_of
+from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables import text
 from sharpfield.recordings.tables.text import open_text
 from sharpfield.storage.event_formats import exporting_events

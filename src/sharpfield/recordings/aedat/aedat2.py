@@ -32,8 +32,17 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import read_blocks, read_head
 from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
-from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    Frame,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    Triggers,
+    begins_with,
+)
 
 FIRST_LINE = b"#!AER-DAT2.0"
 MAX_HEADER, MAX_LINE = 2**20, 2**14

@@ -27,8 +27,17 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import read_head
 from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
-from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    Frame,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    Triggers,
+    begins_with,
+)
 
 FIRST_LINE, LAST_LINE = b"#!AER-DAT3.1\r\n", b"#!END-HEADER\r\n"
 MAX_HEADER = 2**20

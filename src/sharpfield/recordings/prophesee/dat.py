@@ -24,10 +24,17 @@ from numba import njit
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import read_blocks, read_head
 from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt_decode import is_outlier, wrapped_step
 from sharpfield.recordings.prophesee.header import Header, header_size, names_evt, read_header
-from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    Triggers,
+)
 
 EVENTS, EDGES = (0, 12), 14
 """Record types."""

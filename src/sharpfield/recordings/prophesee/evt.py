@@ -15,7 +15,6 @@ from jaxtyping import Int64
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.bytes import read_blocks
 from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt_decode import (
     MAX_PER_WORD,
     NO_ROW,
@@ -30,7 +29,15 @@ from sharpfield.recordings.prophesee.evt_decode import (
     decode_evt21,
 )
 from sharpfield.recordings.prophesee.header import Header, header_size, names_evt, read_header
-from sharpfield.recordings.recording import Chunks, ReadLog, Recording, Triggers
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    Triggers,
+)
 
 EDGES = 4096
 """Capacity for trigger edges of one call of a decoder."""

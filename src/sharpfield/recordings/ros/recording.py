@@ -23,34 +23,40 @@ from pathlib import Path
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import DamagedData, read_head
 from sharpfield.recordings.chunks import merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
 from sharpfield.recordings.prophesee.evt import ENCODINGS as EVT_ENCODINGS
 from sharpfield.recordings.prophesee.evt import decode_chunks, decode_triggers
-from sharpfield.recordings.recording import Chunks, Frame, ReadLog, Recording, Triggers
-from sharpfield.recordings.ros import libcaer, mcap
-from sharpfield.recordings.ros import ros1 as ros1_bag
-from sharpfield.recordings.ros import sqlite as sqlite_bag
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    Frame,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    Triggers,
+)
 from sharpfield.recordings.ros.bag import Bag, FieldReader, Message
 from sharpfield.recordings.ros.event_messages import (
     ARRAYS,
     COMPRESSED,
+    LIBCAER_ENCODINGS,
     PACKETS,
     PLAIN,
     Packet,
     StampedImage,
     decode_image,
+    decode_libcaer,
     event_arrays,
     event_header,
     event_packet,
 )
-from sharpfield.recordings.ros.mcap import open_mcap
-from sharpfield.recordings.ros.ros1 import open_ros1_bag
-from sharpfield.recordings.ros.sqlite import open_sqlite_bag
+from sharpfield.recordings.ros.ros1 import FIRST_LINE, open_ros1_bag
+from sharpfield.recordings.ros.ros2 import MCAP_MAGIC, SQLITE_MAGIC, open_mcap, open_sqlite_bag
 
 OPENERS = {
-    ros1_bag.FIRST_LINE: open_ros1_bag,
-    mcap.MAGIC: open_mcap,
-    sqlite_bag.MAGIC: open_sqlite_bag,
+    FIRST_LINE: open_ros1_bag,
+    MCAP_MAGIC: open_mcap,
+    SQLITE_MAGIC: open_sqlite_bag,
 }
 """Functions to open a bag by its signature; the suffix does not decide, as unfinished bags have
 another."""
@@ -191,12 +197,12 @@ def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> EventSource:
             continue
         stated = (width, height) if width and height else None
         break
-    if encoding not in ("", *EVT_ENCODINGS, *libcaer.ENCODINGS):
+    if encoding not in ("", *EVT_ENCODINGS, *LIBCAER_ENCODINGS):
         raise CaptureError(
             "events are encoded in a way that cannot be read here",
             where=f"{bag.path}, {topic}",
             got=encoding,
-            do=f"known are {', '.join((*EVT_ENCODINGS, *libcaer.ENCODINGS))}",
+            do=f"known are {', '.join((*EVT_ENCODINGS, *LIBCAER_ENCODINGS))}",
         )
     source = EventSource(bag, topic, resolve_size(stated, given, bag.path), encoding, shift_us=0)
     return replace(source, shift_us=_shift_us(source))
@@ -232,7 +238,7 @@ def _decoded(source: EventSource, packets: Iterator[Packet], log: ReadLog) -> Ch
     if encoding in EVT_ENCODINGS:
         payloads = (bytes(packet.payload) for packet in packets)
         return decode_chunks(encoding, payloads, source.size, where=where, log=log)
-    raw_chunks = (libcaer.decode(encoding, packet.payload, packet.base_ns) for packet in packets)
+    raw_chunks = (decode_libcaer(encoding, packet.payload, packet.base_ns) for packet in packets)
     return merge_chunks(raw_chunks, source.size, where=where, log=log)
 
 

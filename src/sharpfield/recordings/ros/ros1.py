@@ -99,8 +99,8 @@ def _scanned(path: Path) -> Connections:
 
 def _connection(read: ReadBytes, record: _Record) -> tuple[int, tuple[str, Topic]]:
     fields = _fields(bytes(read(record.offset, min(record.size, MAX_HEADER))))
-    name = record.fields.get(b"topic", b"").decode("utf-8", "reoffset")
-    kind = fields.get(b"type", b"").decode("utf-8", "reoffset")
+    name = record.fields.get(b"topic", b"").decode("utf-8", "replace")
+    kind = fields.get(b"type", b"").decode("utf-8", "replace")
     return record.number(b"conn", 4), (name, topic_of(kind, cdr=False))
 
 

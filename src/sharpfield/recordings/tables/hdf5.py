@@ -30,8 +30,14 @@ import h5py
 import numpy as np
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
-from sharpfield.recordings.recording import Frame, Recording
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Format,
+    Frame,
+    ReaderOptions,
+    Recording,
+    begins_with,
+)
 from sharpfield.recordings.tables.columns import column_recording
 from sharpfield.storage.event_columns import known_unit, whole_us
 from sharpfield.storage.event_file import UNREADABLE, EventFile

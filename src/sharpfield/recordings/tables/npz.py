@@ -36,8 +36,15 @@ from jaxtyping import Shaped
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import read_blocks, read_head, zip_holds
 from sharpfield.recordings.chunks import RawChunk, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions, begins_with
-from sharpfield.recordings.recording import Chunks, ReadLog, Recording
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+    begins_with,
+)
 from sharpfield.recordings.tables.columns import column_recording
 from sharpfield.storage.event_columns import ZippedColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile

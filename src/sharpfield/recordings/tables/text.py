@@ -27,8 +27,14 @@ import numpy as np
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.recordings.bytes import BLOCK, ZIP, read_blocks, read_head, zip_holds
 from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
-from sharpfield.recordings.format import NO_OPTIONS, Format, ReaderOptions
-from sharpfield.recordings.recording import Chunks, ReadLog, Recording
+from sharpfield.recordings.recording import (
+    NO_OPTIONS,
+    Chunks,
+    Format,
+    ReaderOptions,
+    ReadLog,
+    Recording,
+)
 from sharpfield.recordings.tables.text_decode import (
     EVENTS,
     FIRST_INVALID,
