@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage import event_file
+from sharpfield.storage.event_file import EventFile
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events
 
@@ -105,3 +108,51 @@ def test_a_damaged_chunk_names_its_events(tmp_path):
         with pytest.raises(CaptureError, match="cannot read events") as caught:
             file.part(400, 1000)
     assert "column p, events 400 to 999" in str(caught.value)
+
+
+# Clocks of events and poses
+
+
+POSES = (1_000_000, 2_200_000)
+
+
+def check(events_us, known_us=POSES):
+    """An opened file whose first and last event have these times."""
+    file = EventFile(Path("events.h5"), {"t": np.array(events_us)}, unit="us", size=None)
+    file.expect_overlap(known_us, known="poses", do="give the unit")
+
+
+@pytest.mark.parametrize(
+    "events",
+    [(1_000_439, 2_199_999), (0, 10_000_000), (1_500_000, 1_600_000), (2_200_000, 2_300_000)],
+)
+def test_events_that_overlap_pass(events):
+    check(events)
+
+
+def test_ns_taken_for_us_are_recognised():
+    with pytest.raises(CaptureError) as caught:
+        check((1_000_438_515, 2_199_999_087))
+    assert str(caught.value).splitlines() == [
+        "CaptureError: events and poses were not taken at the same time",
+        "  where  events.h5",
+        "  got    events from 1000438515 to 2199999087 us, poses from 1000000 to 2200000 us",
+        "  do     event times look like ns where us were expected: give the unit",
+    ]
+
+
+def test_us_taken_for_ns_are_recognised():
+    with pytest.raises(CaptureError, match="event times look like us where ns were expected"):
+        check((1_000, 2_200))
+
+
+def test_wrong_units_are_recognised_even_where_clocks_overlap_at_zero():
+    with pytest.raises(CaptureError, match="look like ns"):
+        check((0, 10**9), (0, 10**6))
+    with pytest.raises(CaptureError, match="look like us"):
+        check((0, 10**3), (0, 10**6))
+
+
+def test_another_zero_is_not_taken_for_another_unit():
+    with pytest.raises(CaptureError, match="count from the same instant"):
+        check((5_000_000, 6_000_000))

@@ -2,25 +2,20 @@
 
 A file is gone through a chunk at a time, so it need not fit in memory. Where a file does not say
 the unit of its times, times in us and rates are None and the stored ones are given instead.
-
-Frames at a fraction of their size, for machines with less time.
 """
 
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Shaped
 
 from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.captures.layouts import llff_events
 from sharpfield.captures.native.known import known_table
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import DepthMaps, Frames
 from sharpfield.geometry.trajectory import count_tracks
@@ -223,56 +218,3 @@ def _trajectory_summary(capture: Capture) -> dict[str, Any]:
     centres = capture.trajectory.pose(instants, torch.zeros(PATH_SAMPLES).long())[:, :, 3]
     length = float(centres.diff(dim=0).norm(dim=-1).sum())
     return about | {"t_first_us": known[0], "t_last_us": known[1], "path_length": length}
-
-
-def downscaled(capture: Capture, factor: int) -> Capture:
-    """A capture whose frames have a fraction of the width and height.
-
-    Stored values are averaged as they are, which is how published data sets were made smaller.
-
-    Args:
-        capture: Frames only; counts of events do not add up over pixels.
-        factor: Pixels to each side that become one; what is left over at the border is cut off.
-
-    Raises:
-        OptionError: There are events, or the factor is larger than the image.
-    """
-    frames = capture.needed_frames
-    if capture.events is not None:
-        raise OptionError(
-            "captures with events cannot be made smaller",
-            where=capture.name,
-            got=f"{len(capture.events)} events",
-            do="leave the events out, or use the full size",
-        )
-    width, height = frames.width // factor, frames.height // factor
-    if factor < 1 or not (width and height):
-        raise OptionError(
-            "frames cannot be made that small",
-            where=capture.name,
-            got=f"{frames.width}x{frames.height} by {factor}",
-        )
-    camera = replace(
-        capture.camera,
-        width=width,
-        height=height,
-        **{
-            name: getattr(capture.camera, name) / factor
-            for name in ("fx_px", "fy_px", "cx_px", "cy_px")
-        },
-    )
-
-    def small(images: Shaped[np.ndarray, "n h w c"]) -> Shaped[np.ndarray, "n y x c"]:
-        cut = np.asarray(images)[:, : height * factor, : width * factor]
-        resized = [cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in cut]
-        return np.stack(resized).reshape(len(cut), height, width, -1)
-
-    smaller: Frames = replace(
-        frames,
-        images=small(frames.images),
-        truth=None if frames.truth is None else small(frames.truth),
-        depth=None,
-        flow=None,
-        blur_px=None if frames.blur_px is None else frames.blur_px / factor,
-    )
-    return replace(capture, camera=camera, frames=smaller)

@@ -21,8 +21,10 @@ CHUNK = 2**20
 """Events looked at together; bounds the memory of whatever goes through a file."""
 
 SEARCHED = 2**16
-"""Times unpacked at once when looking for one: an HDF5 chunk or so."""
+"""Times decompressed at once when searching for one: about one HDF5 chunk."""
 
+THOUSAND = (300.0, 3000.0)
+"""A ratio of two durations in this range is taken for a factor of 1000 between their units."""
 
 UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, SyntaxError, tokenize.TokenError),
@@ -140,6 +142,35 @@ class EventFile:
             return 0, 0
         return int(self._times(0, 1)[0]), int(self._times(len(self) - 1, len(self))[0])
 
+    def expect_overlap(self, known_us: tuple[int, int], *, known: str, do: str) -> None:
+        """Check that events were recorded at the same time as something else, such as poses.
+
+        A wrong unit of time is the commonest mistake of all.
+
+        Args:
+            known_us: First and last time of the other clock.
+            known: What the other clock belongs to, e.g. "poses".
+            do: How to give another unit.
+
+        Raises:
+            CaptureError: The two do not overlap, or one lasts about 1000 times as long as the
+                other.
+        """
+        events_us = self.span_us()
+        lasts, expected = (max(span[1] - span[0], 1) for span in (events_us, known_us))
+        common = min(events_us[1], known_us[1]) - max(events_us[0], known_us[0])
+        hint = _unit_hint(lasts / expected)
+        if common >= 0 and not hint:
+            return
+        hint = hint or _unit_hint(max(events_us[1], 1) / max(known_us[1], 1))
+        raise CaptureError(
+            f"events and {known} were not taken at the same time",
+            where=self.path,
+            got=f"events from {events_us[0]} to {events_us[1]} us,"
+            f" {known} from {known_us[0]} to {known_us[1]} us",
+            do=f"{hint}: {do}" if hint else f"check that both count from the same instant; {do}",
+        )
+
     def first_at(self, time_us: int) -> int:
         """Number of the first event at or after a time; the count of events if there is none."""
         low, high = 0, len(self)
@@ -191,3 +222,11 @@ class EventFile:
                 do="give width and height in pixels",
             )
         return self.size
+
+
+def _unit_hint(ratio: float) -> str:
+    if THOUSAND[0] < ratio < THOUSAND[1]:
+        return "event times look like ns where us were expected"
+    if THOUSAND[0] < 1 / ratio < THOUSAND[1]:
+        return "event times look like us where ns were expected"
+    return ""

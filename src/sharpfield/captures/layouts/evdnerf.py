@@ -28,7 +28,7 @@ from jaxtyping import Float, Float64, Int64, Shaped
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._transforms import (
     ONE_SECOND,
-    TimedViews,
+    ViewSet,
     expect_one_camera,
     images_of,
     number,
@@ -122,7 +122,7 @@ class _Set:
     """The views of one set."""
 
     name: str
-    views: TimedViews
+    views: ViewSet
     count: int
     """Number of views."""
 
@@ -213,7 +213,7 @@ def _streams(
     """The events of each view of all sets, their thresholds, and remarks."""
     streams: list[EventStream] = []
     threshold = options.threshold
-    notes: dict[str, Note] = {"clock": "said to last one second"}
+    notes: dict[str, Note] = {"clock": "defined to last one second"}
     for one in sets:
         plain, sums = folder / f"data_{one.name}.npz", folder / f"data_frames_{one.name}.npy"
         pickled = [folder / name.format(one.name) for name in PICKLED]
@@ -298,7 +298,7 @@ def _summed(path: Path, one: _Set, threshold: float | None) -> tuple[list[EventS
 
 
 def _camera(
-    views: TimedViews,
+    views: ViewSet,
     streams: list[EventStream],
     images: Shaped[np.ndarray, "n h w c"] | None,
     folder: Path,

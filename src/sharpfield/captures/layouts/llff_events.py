@@ -26,7 +26,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64, Shaped
 
-from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import choose_images
@@ -209,10 +208,8 @@ def _events(
     with open_events(folder / "events.h5", unit=event_unit, size=camera.size) as opened:
         file = opened if opened.unit else replace(opened, unit=variant.event_unit)
         if len(file):
-            expect_overlap(
-                file.span_us(),
+            file.expect_overlap(
                 known_us,
-                where=file.path,
                 known="poses",
                 do="give the unit of the events, ns or us (`event_unit`)",
             )

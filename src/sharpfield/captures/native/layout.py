@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from sharpfield.captures.clocks import expect_overlap
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.native.frames import (
     files_of,
@@ -227,10 +226,8 @@ def _read_events(about: Table, path: Path, camera: Camera, clock: Clock) -> Even
     with open_events(path, unit=unit or None) as file:
         sized = file if file.size else replace(file, size=camera.size)
         if len(sized):
-            expect_overlap(
-                sized.span_us(),
+            sized.expect_overlap(
                 (clock.origin_us, clock.origin_us + clock.span_us),
-                where=path,
                 known="the capture's clock",
                 do=f'give the unit in {DESCRIPTION}: [events] unit = "ns"',
             )

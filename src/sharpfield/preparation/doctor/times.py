@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sharpfield.captures.clocks import THOUSAND
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.preparation.doctor.findings import Checkup
+from sharpfield.storage.event_file import THOUSAND
 
 SHORTEST_US, LONGEST_US = 20, 2_000_000
 """Exposures that cameras have; others are probably in another unit."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.summary import downscaled
+from benchmarks.photos import downscaled
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
