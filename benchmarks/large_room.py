@@ -257,7 +257,7 @@ def main() -> None:
 def changes(recipe: str, points: int) -> list[str]:
     """So many points, that grow once before the run is resumed."""
     if recipe == "room-splat":
-        return [f"gaussians.budget={points}", "gaussians.start=0.9", "gaussians.grow_every=4"]
+        return [f"gaussians.cap_max={points}", "gaussians.start=0.9", "gaussians.grow_every=4"]
     return [
         f"cloud.voxel={voxel(points):.5f}",
         "cloud.budget=0",

@@ -112,7 +112,7 @@ def main() -> None:
     for name, preset in ((name, presets[name]) for name in asked.only):
         run = asked.out / name
         recipe = prepared("ev-splat", preset, capture=capture, device="cpu")
-        recipe = replace(recipe, unknowns=replace(recipe.unknowns, threshold=GUESS))
+        recipe = replace(recipe, calibration=replace(recipe.calibration, threshold=GUESS))
         started = RunConfig("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
         start(started, capture, run, options, device="cpu", console=console)
         opened = open_run(run, capture=None, device="cpu")
@@ -127,14 +127,14 @@ def main() -> None:
 def _row(
     model: Any, metrics: dict[str, Any], truth: Capture, thresholds: tuple[float, float]
 ) -> dict[str, Any]:
-    darker, brighter = model.unknowns.both_thresholds()
+    darker, brighter = model.calibration.threshold_pair()
     degrees, percent = pose_error(model.capture, truth)
     return {
         "darker": darker,
         "off %": 100 * (darker / thresholds[0] - 1),
         "brighter": brighter,
         "off % ": 100 * (brighter / thresholds[1] - 1),
-        "late us": model.unknowns.offset_us,
+        "late us": model.calibration.offset_us,
         "pose deg": degrees,
         "pose % depth": percent,
         "psnr": metrics["mean"]["psnr"],

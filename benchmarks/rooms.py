@@ -59,7 +59,7 @@ STUDIES = {
         Contender("hybrid"),
         Contender("hybrid", changes=("quality=even",)),
         Contender("room-splat"),
-        Contender("room-splat", changes=("looks.quality=even",)),
+        Contender("room-splat", changes=("sampling.frame_quality=even",)),
     ),
     "capacity": (
         Contender("point-nerf"),

@@ -9,7 +9,7 @@ from benchmarks.whole_way import errors, learned, path_file, recorded, taken_in,
 pytest.importorskip("lz4")
 pytest.importorskip("rosbags")
 
-STEPS = ("--steps", 2, "--change", "gaussians.budget=100")
+STEPS = ("--steps", 2, "--change", "gaussians.cap_max=100")
 
 
 def test_all_containers_of_a_recording_give_the_same_capture_and_run(tmp_path: Path) -> None:

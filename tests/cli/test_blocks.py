@@ -19,7 +19,7 @@ from tests.cli.command import run
 
 STEPS = 30
 TRAINED = ("--steps", str(STEPS), "--device", "cpu", "--checkpoint-every", "5")
-SMALL = ("--change", "gaussians.budget=200", "looks.quality=even")
+SMALL = ("--change", "gaussians.cap_max=200", "sampling.frame_quality=even")
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +43,8 @@ def tensors(path: Path) -> bytes:
 def test_blocks_become_one_run_of_what_lies_in_each(alone: Path):
     parts = [open_run(alone / "blocks" / name).model for name in ("1of2", "2of2")]
     whole = open_run(alone)
-    found = len(whole.model.scene.gaussians)
-    assert 0 < found < sum(len(part.scene.gaussians) for part in parts)
+    found = len(whole.model.scene.static)
+    assert 0 < found < sum(len(part.scene.static) for part in parts)
     assert whole.config.block == "" and len(whole.capture.split.train) == 32
     assert read_ledger(alone).finished
 
@@ -66,7 +66,7 @@ def test_finished_blocks_of_other_settings_are_refused(
     capture: Path, alone: Path, capsys: pytest.CaptureFixture[str]
 ):
     before = tensors(alone)
-    others = (*TRAINED, *SMALL, "looks.depth=0.2")
+    others = (*TRAINED, *SMALL, "sampling.depth_weight=0.2")
     assert run("blocks", "room-splat", str(capture), "--out", str(alone), *others) == 2
     assert "depth" in capsys.readouterr().err
     assert tensors(alone) == before
@@ -86,8 +86,8 @@ def test_workers_side_by_side_one_of_them_killed_make_the_same(capture: Path, al
     assert started.returncode == 0, said.decode()[-2000:]
     for part in ("blocks/1of2", "blocks/2of2", "."):
         one, other = (open_run(folder / part).model for folder in (alone, out))
-        for name, values in one.scene.gaussians.points().items():
-            assert np.array_equal(values.detach(), other.scene.gaussians.points()[name].detach())
+        for name, values in one.scene.static.points().items():
+            assert np.array_equal(values.detach(), other.scene.static.points()[name].detach())
 
 
 def _killed_after_a_checkpoint(run_folder: Path, parent: subprocess.Popen) -> bool:

@@ -28,7 +28,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def splats(recorded: Path) -> Path:
     out = recorded.parent / "ev-splat"
-    words = ("--steps", 30, "--change", "gaussians.budget=300")
+    words = ("--steps", 30, "--change", "gaussians.cap_max=300")
     assert run("train", "ev-splat", recorded, "--out", out, *words) == 0
     return out
 

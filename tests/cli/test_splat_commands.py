@@ -17,7 +17,7 @@ from sharpfield.runs.run import open_run
 from sharpfield.storage.splat_file import read_splats
 from tests.cli.command import run
 
-SMALL = ("--steps", 4, "--change", "gaussians.budget=300")
+SMALL = ("--steps", 4, "--change", "gaussians.cap_max=300")
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_what_is_exported_looks_the_same_in_the_captures_own_world(
     model, capture = opened.model, opened.capture
     scene, world = import_splats(tmp_path / "scene.ply"), np.array([1])
     draw = Splatting(capture.camera, model.tone.decode)
-    assert len(scene) == len(model.scene.gaussians)
+    assert len(scene) == len(model.scene.static)
     with torch.no_grad():
         found = draw(scene, whole(capture.camera, capture.frame_pose(world)[0], 0.5))[0, ..., 0]
     seen = render_view(model, capture.camera, model.capture.frame_pose(world)[0], 0.5)

@@ -90,11 +90,11 @@ def test_depth_errors_are_relative_robust_and_only_of_known_pixels():
 def test_a_room_learns_its_depth():
     capture = wall()
     recipe = RoomSplat(steps=8)
-    gaussians = replace(recipe.gaussians, budget=300, growth="none")
-    looks = replace(recipe.looks, still=0.0, quality="images")
-    model = replace(recipe, gaussians=gaussians, looks=looks).build(capture, 0)
+    gaussians = replace(recipe.gaussians, cap_max=300, growth="none")
+    sampling = replace(recipe.sampling, sharp_warmup=0.0, frame_quality="images")
+    model = replace(recipe, gaussians=gaussians, sampling=sampling).build(capture, 0)
     terms = model.losses(model.draw(5), 5)
     assert 0 < float(terms["depth"].detach()) < 0.1
     assert float(terms["blur"].detach()) > 0
     terms["depth"].backward()
-    assert model.scene.gaussians.means.grad.abs().sum() > 0
+    assert model.scene.static.means.grad.abs().sum() > 0

@@ -7,10 +7,8 @@ import torch
 from torch import Tensor
 
 from sharpfield.core.measurements import EventPairs
-from sharpfield.core.rays import Radiance
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds
-from sharpfield.formation.response import FixedResponse
-from sharpfield.losses.event_counts import changes, count_error, threshold_error
+from sharpfield.losses.event_counts import count_error, threshold_error
 
 SIZE = (2, 3, 5, 4)
 """Looks, windows, height and width."""
@@ -40,32 +38,6 @@ def counted(change: Tensor, slack: Tensor | None = None) -> EventPairs:
 
 def moved(seed: int = 0, size: tuple[int, int, int, int] = SIZE) -> Tensor:
     return torch.randn(*size, 1, generator=generator(seed))
-
-
-def views(seed: int = 0, channels: int = 3) -> Radiance:
-    """Of `SIZE`: one more view than windows."""
-    m, q, h, w = SIZE
-    rgb = torch.rand(m, h, w, q + 1, channels, generator=generator(seed)) + 0.1
-    one = torch.ones(m, h, w, q + 1)
-    return Radiance(rgb, one, one, one)
-
-
-def test_changes_are_differences_of_log_luma_pixel_by_pixel():
-    light = views()
-    found = changes(light, counted(torch.zeros(*SIZE, 1)), FixedResponse(floor=0.0))
-    luma = (light.rgb * torch.tensor([0.299, 0.587, 0.114])).sum(-1)
-    for m in range(2):
-        for q in range(3):
-            wanted = (luma[m, :, :, q + 1] / luma[m, :, :, q]).log()
-            torch.testing.assert_close(found[m, q, :, :, 0], wanted)
-
-
-def test_behind_a_filter_they_are_those_of_each_colour():
-    light = views()
-    found = changes(light, counted(torch.zeros(*SIZE, 3)), FixedResponse(floor=0.0))
-    log = light.rgb.log()
-    wanted = (log[:, :, :, 1:] - log[:, :, :, :-1]).movedim(3, 1)
-    torch.testing.assert_close(found, wanted)
 
 
 def test_the_right_scene_has_no_error_and_others_have_theirs_in_events():

@@ -14,10 +14,11 @@ from sharpfield.core.protocols import Growing, Model
 from sharpfield.core.rays import Rays, Views
 from sharpfield.evaluation.event_scores import HasLogLight
 from sharpfield.geometry.normalise import centred
-from sharpfield.initialisation.moving import backdrop, hull_between
-from sharpfield.recipes.dynamic_splat import DynamicSplat, EvDynamicSplat
-from sharpfield.recipes.splats.dynamic_model import DynamicModel
+from sharpfield.initialisation.static_points import backdrop
+from sharpfield.initialisation.visual_hull import box_cells, moving_cells
+from sharpfield.recipes.splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
+from sharpfield.recipes.splats.model import SplatModel
 from sharpfield.rendering.view import ViewRenderer, render_view
 from sharpfield.storage.event_cache import event_index
 from sharpfield.training.checkpoint import file_of
@@ -70,14 +71,14 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
     model = small().build(blurred(), 0)
     late_from = model.heaviest_step
     early, late = model.draw(late_from - 1), model.draw(late_from)
-    assert set(early) == {"look", "sharp"} and early["look"].shape == (2, 1)
-    assert set(late) == {"look", "rest", "frames", "sharp", "events"}
-    assert late["look"].shape == (2, 4) and late["rest"].shape == (2, 6)
+    assert set(early) == {"views", "latent_frames"} and early["views"].shape == (2, 1)
+    assert set(late) == {"views", "no_grad_views", "frames", "latent_frames", "events"}
+    assert late["views"].shape == (2, 4) and late["no_grad_views"].shape == (2, 6)
     assert late["events"].shape == (2, 3, 16, 16, 1)
-    assert len(set(late["look"].track[:, 0].tolist())) == 2, "two cameras"
-    assert (late["look"].time == late["look"].time[:1]).all(), "at the same instants"
-    assert set(model.losses(late, late_from)) == {"blur", "sharp", "events", "idle", "fleeting"}
-    assert set(model.losses(late, STEPS - 1)) == {"blur", "sharp", "events"}, "growing has ended"
+    assert len(set(late["views"].track[:, 0].tolist())) == 2, "two cameras"
+    assert (late["views"].time == late["views"].time[:1]).all(), "at the same instants"
+    assert set(model.losses(late, late_from)) == {"blur", "latent", "events", "reg", "lifespan"}
+    assert set(model.losses(late, STEPS - 1)) == {"blur", "latent", "events"}, "growing has ended"
 
 
 def test_sharp_frames_are_carried_to_both_ends_of_any_stretch():
@@ -85,9 +86,14 @@ def test_sharp_frames_are_carried_to_both_ends_of_any_stretch():
     lengths = set()
     for step in range(model.heaviest_step, STEPS):
         batch = model.draw(step)
-        assert set(batch) == {"look", "sharp", "events"} and batch["look"].shape == (2, 2)
-        assert batch["events"].shape == (2, 1, 16, 16, 1) and batch["sharp"].shape == (2, 16, 16, 2)
-        first, last = batch["look"].time[0].tolist()
+        assert set(batch) == {"views", "latent_frames", "events"} and batch["views"].shape == (2, 2)
+        assert batch["events"].shape == (2, 1, 16, 16, 1) and batch["latent_frames"].shape == (
+            2,
+            16,
+            16,
+            2,
+        )
+        first, last = batch["views"].time[0].tolist()
         assert 0 <= first < last <= 1
         lengths.add(last - first)
     assert max(lengths) > 3 * min(lengths)
@@ -119,7 +125,7 @@ def test_what_stands_still_learns_alone_at_first():
     with torch.no_grad():
         first, later, done = (model.scene.draw(views, step=step).rgb for step in (0, 39, None))
     assert not torch.equal(first, later) and torch.equal(later, done)
-    moving = next(group for group in model.groups() if group.name == "velocities")
+    moving = next(group for group in model.groups() if group.name == "moving velocities")
     assert moving.rate(0) == 0 and moving.rate(39) > 0
 
 
@@ -138,14 +144,14 @@ def test_views_of_different_times_are_drawn_each_at_its_own():
 def test_moving_ones_start_where_something_moves():
     """The hub of the rotor is at the origin, which frames alone always see it cover."""
     capture, _ = centred(tiny_moving())
-    told = hull_between(capture, event_index(capture.needed_events), (0.3, 0.7))
-    assert told is not None and told.places.norm(dim=-1).min() < 0.1
-    shown = hull_between(capture, None, (0.3, 0.7))
-    assert shown is not None and 0 < shown.kept.sum() < told.kept.sum() < len(told.kept)
-    assert hull_between(capture, None, (0.30, 0.31)) is None, "no frame is there"
+    by_events = moving_cells(capture, event_index(capture.needed_events), (0.3, 0.7))
+    assert by_events is not None and by_events.norm(dim=-1).min() < 0.1
+    by_frames = moving_cells(capture, None, (0.3, 0.7))
+    assert by_frames is not None and 0 < len(by_frames) < len(by_events) < len(box_cells())
+    assert moving_cells(capture, None, (0.30, 0.31)) is None, "no frame is there"
     moving = small().build(tiny_moving(), 0).scene.moving
-    assert moving.moments.min() >= 0 and moving.moments.max() <= 1
-    assert moving.moments.sort().values.diff().max() < 0.1, "at all times"
+    assert moving.centre_times.min() >= 0 and moving.centre_times.max() <= 1
+    assert moving.centre_times.sort().values.diff().max() < 0.1, "at all times"
 
 
 def test_the_backdrop_is_what_cameras_see_most_of_the_time():
@@ -162,29 +168,34 @@ def test_the_backdrop_is_what_cameras_see_most_of_the_time():
 def test_it_is_a_model_that_grows_and_draws_views():
     model = small().build(tiny_moving(), 0)
     assert isinstance(model, Model | Growing | ViewRenderer | HasLogLight)
-    with pytest.raises(OptionError, match="draws whole views"):
+    with pytest.raises(OptionError, match="renders whole views"):
         model.render(Rays(torch.zeros(1, 3), torch.ones(1, 3), torch.ones(1), torch.ones(1)))
 
 
 def test_thresholds_gains_and_offsets_can_be_learned():
     unknowns = LearnedCalibrationOptions(thresholds="signs", gains=True, offset=True)
-    model = small(unknowns=unknowns).build(tiny_moving(), 0)
-    assert {"unknowns", "offset"} <= {group.name for group in model.groups()}
+    model = small(calibration=unknowns).build(tiny_moving(), 0)
+    assert {"calibration", "offset"} <= {group.name for group in model.groups()}
     losses = model.losses(model.draw(STEPS - 1), STEPS - 1)
     assert {"thresholds", "prior"} <= losses.keys()
     sum(losses.values()).backward()
-    assert model.unknowns.offset_steps is not None
-    assert model.unknowns.offset_steps.grad.abs() > 0, "a stretch of events tells when it was"
+    assert model.calibration.offset_steps is not None
+    assert model.calibration.offset_steps.grad.abs() > 0, "a stretch of events tells when it was"
     model.losses(model.draw(STEPS - 2), STEPS - 2)["blur"].backward()
-    assert model.unknowns.log_gain is not None and model.unknowns.log_gain.grad is not None
-    assert model.unknowns.log_gain.grad.any(), "frames tell how long they were exposed"
+    assert model.calibration.log_gain is not None and model.calibration.log_gain.grad is not None
+    assert model.calibration.log_gain.grad.any(), "frames tell how long they were exposed"
 
 
-def test_coloured_events_are_refused():
-    capture = tiny_moving()
+@pytest.mark.parametrize("frames", [True, False])
+def test_events_behind_a_colour_filter_are_learned_from(frames: bool):
+    capture = tiny_moving().without(frames=not frames)
     coloured = replace(capture, events=replace(capture.needed_events, bayer="RGGB"))
-    with pytest.raises(CaptureError, match="grey sensors"):
-        small().build(coloured, 0)
+    model = small().build(coloured, 0)
+    batch = model.draw(STEPS - 1)
+    assert batch["events"].shape[-1] == 3
+    terms = model.losses(batch, STEPS - 1)
+    terms["events"].backward()
+    assert model.scene.moving.base_harmonics.grad.any() and torch.isfinite(terms["events"])
 
 
 def test_a_capture_without_what_is_needed_is_refused():
@@ -197,11 +208,16 @@ def test_a_capture_without_what_is_needed_is_refused():
 def test_resuming_equals_never_having_stopped(tmp_path: Path):
     recipe, stop_at = small(), 26
 
-    class Dying(DynamicModel):
+    class Dying(SplatModel):
         def draw(self, step: int) -> Any:
             if step == stop_at:
                 raise KeyboardInterrupt
             return super().draw(step)
+
+    def dying(steps: int) -> SplatModel:
+        model = recipe.build(tiny_moving(), 1)
+        model.__class__ = Dying
+        return model
 
     def go(folder: str, build: Any, *, resume: bool = False) -> bytes:
         options = Options(checkpoint_every=5, resume=resume)
@@ -210,5 +226,5 @@ def test_resuming_equals_never_having_stopped(tmp_path: Path):
 
     straight = go("straight", lambda steps: recipe.build(tiny_moving(), 1))
     with pytest.raises(KeyboardInterrupt):
-        go("stopped", lambda steps: Dying(recipe, tiny_moving(), 1))
+        go("stopped", dying)
     assert go("stopped", lambda steps: recipe.build(tiny_moving(), 1), resume=True) == straight

@@ -8,7 +8,7 @@ import torch
 
 from sharpfield.fields.voxels import VoxelSizes
 from sharpfield.geometry.normalise import centred
-from sharpfield.initialisation.visual_hull import hull, silhouettes
+from sharpfield.initialisation.visual_hull import silhouettes, visual_hull
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
 from sharpfield.recipes.volume.voxel_scene import MovingOptions
 from sharpfield.simulation.cameras.rigs import hand_held, ring
@@ -90,7 +90,7 @@ def test_voxels_move_only_within_the_hull():
     start = SMALL.build(capture, 0).scene.field
     model = learned(SMALL, capture, 8)
     size = SMALL.scene.size
-    told = hull(
+    told = visual_hull(
         model.capture, event_index(capture.needed_events), cells=size.moving, moments=size.moments
     )
     assert told is not None and told.solid.any()
@@ -114,7 +114,7 @@ def puppet():
 def test_the_hull_holds_what_moves(puppet):
     """By the true depth of what a held-out camera sees."""
     capture, _ = puppet
-    told = hull(capture, event_index(capture.needed_events), cells=24, moments=17)
+    told = visual_hull(capture, event_index(capture.needed_events), cells=24, moments=17)
     assert told is not None and told.possible.float().mean() < 0.3
     frames, camera, covered = capture.needed_frames, capture.camera, []
     toward = camera.direction(camera.grid()).float()
@@ -145,7 +145,7 @@ def test_no_hull_without_cameras_that_stand_still():
         "glider", hand_held(), rig=replace(MOVING_RIG, size=(12, 12)), timing=timing
     )
     capture, _ = centred(carried)
-    assert hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
+    assert visual_hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
     field = SMALL.build(carried, 0).scene.field
     assert all((rows >= 0).all() for rows in field.rows)
 

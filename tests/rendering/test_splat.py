@@ -28,7 +28,7 @@ def cloud(count: int = 30) -> Gaussians:
     points = torch.randn(count, 3, generator=made) * torch.tensor([1.0, 0.7, 0.4])
     points[:, 2] += 3
     colours = torch.rand(count, 3, generator=made)
-    found = Gaussians.start(points, colours, torch.full((count,), 0.15), degree=1, opacity=0.6)
+    found = Gaussians.start(points, colours, torch.full((count,), 0.15), sh_degree=1, opacity=0.6)
     found.higher_harmonics.data += 0.2 * torch.randn(count, 3, 3, generator=made)
     return found
 

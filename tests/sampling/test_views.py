@@ -36,11 +36,11 @@ def busy() -> Capture:
 
 
 def looks(capture: Capture, seed: int = 0, **options) -> ViewSampler:
-    return ViewSampler(SamplingOptions(**options), capture, seed)
+    return ViewSampler(SamplingOptions(**options), capture, seed, steps=100)
 
 
 def of(batch: Batch) -> tuple[Instants, EventPairs | None]:
-    look, events = batch["look"], batch.get("events")
+    look, events = batch["views"], batch.get("events")
     assert isinstance(look, Instants) and (events is None or isinstance(events, EventPairs))
     return look, events
 
@@ -56,10 +56,10 @@ def same(one: Batch, other: Batch) -> bool:
 
 @pytest.mark.parametrize("instants", [1, 2, 5])
 def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Capture, instants: int):
-    made = looks(tiny, instants=instants)
+    made = looks(tiny, grad_views=instants)
     begin, end = (tiny.clock.unit(int(t)).item() for t in tiny.needed_events.t_us[[0, -1]])
     for step in range(12):
-        batch = made.exposure(step, events=True, sensor_estimate=BELIEF)
+        batch = made.exposure_batch(step, BELIEF, events=True)
         look, _ = of(batch)
         frames = batch["frames"]
         assert isinstance(frames, Pixels) and look.shape == (1, instants + 1)
@@ -74,10 +74,10 @@ def test_instants_of_an_exposure_ascend_within_it_and_count_for_one(tiny: Captur
 
 
 def test_each_instant_has_a_share_of_the_exposure_of_its_own(tiny: Capture):
-    made = looks(tiny, instants=4)
+    made = looks(tiny, grad_views=4)
     for step in range(8):
-        batch = made.exposure(step, events=False, sensor_estimate=BELIEF)
-        look, frames = batch["look"], batch["frames"]
+        batch = made.exposure_batch(step, BELIEF, events=False)
+        look, frames = batch["views"], batch["frames"]
         assert isinstance(look, Instants) and isinstance(frames, Pixels)
         opens, closes = frames.open.unique(), frames.close.unique()
         place = (look.time[0] - opens) / (closes - opens)
@@ -89,18 +89,18 @@ def test_every_frame_is_looked_at_once_before_any_twice(tiny: Capture):
     for epoch in (0, 3):
         steps = range(epoch * len(train), (epoch + 1) * len(train))
         seen = [
-            int(made.exposure(s, events=False, sensor_estimate=BELIEF)["frames"].frame.unique())
+            int(made.exposure_batch(s, BELIEF, events=False)["frames"].frame.unique())
             for s in steps
         ]
         assert sorted(seen) == train
 
 
 def test_frames_are_as_stored(tiny: Capture):
-    made, frames = looks(tiny, blur="none", windows=0.0, sharp=0.0), tiny.needed_frames
+    made, frames = looks(tiny, blur="none", event_weight=0.0, latent_weight=0.0), tiny.needed_frames
     for step in range(4):
-        batch = made.exposure(step, events=True, sensor_estimate=BELIEF)
-        look, seen = batch["look"], batch["frames"]
-        assert set(batch) == {"look", "frames"} and isinstance(seen, Pixels)
+        batch = made.exposure_batch(step, BELIEF, events=True)
+        look, seen = batch["views"], batch["frames"]
+        assert set(batch) == {"views", "frames"} and isinstance(seen, Pixels)
         frame = int(seen.frame[0, 0, 0])
         stored = torch.from_numpy(frames.images[frame] / np.float32(255))
         torch.testing.assert_close(seen.value, stored[None])
@@ -112,10 +112,10 @@ def test_frames_are_as_stored(tiny: Capture):
 
 def test_views_that_are_only_drawn_fill_the_exposure(tiny: Capture):
     """Together with those that teach, each has a share of it of its own, and they count alike."""
-    made, taken = looks(tiny, instants=2, draws=3), set()
+    made, taken = looks(tiny, grad_views=2, views=6), set()
     for step in range(12):
-        batch = made.exposure(step, events=False, sensor_estimate=BELIEF)
-        look, rest, frames = batch["look"], batch["rest"], batch["frames"]
+        batch = made.exposure_batch(step, BELIEF, events=False)
+        look, rest, frames = batch["views"], batch["no_grad_views"], batch["frames"]
         assert isinstance(look, Instants) and isinstance(rest, Instants)
         assert isinstance(frames, Pixels)
         opens, closes = frames.open.unique(), frames.close.unique()
@@ -152,7 +152,7 @@ def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
     capture, known = busy(), 0
     made, whole = looks(capture), capture.needed_events
     index = event_index(whole)
-    for batch in (made.exposure(3, events=True, sensor_estimate=BELIEF), made.stretch(5)):
+    for batch in (made.exposure_batch(3, BELIEF, events=True), made.event_batch(5)):
         look, events = of(batch)
         assert events is not None and events.shape == (1, look.shape[1] - 1, 12, 16, 1)
         t_us = capture.clock.us(look.time[0].double().numpy())
@@ -181,19 +181,19 @@ def test_windows_hold_the_events_of_each_pixel_and_the_parts_at_both_ends():
 
 
 def test_windows_follow_each_other_from_instant_to_instant(tiny: Capture):
-    look, events = of(looks(tiny, instants=4).exposure(2, events=True, sensor_estimate=BELIEF))
+    look, events = of(looks(tiny, grad_views=4).exposure_batch(2, BELIEF, events=True))
     assert events is not None
     assert torch.equal(events.start[0, :, 0, 0, 0], look.time[0, :-1])
     assert torch.equal(events.end[0, :, 0, 0, 0], look.time[0, 1:])
 
 
 def test_stretches_lie_within_the_events_and_are_of_all_lengths(tiny: Capture):
-    made = looks(tiny, shortest_us=1_000, longest_us=30_000)
+    made = looks(tiny, min_window_us=1_000, max_window_us=30_000)
     t_us = tiny.needed_events.t_us
     begin, end = (float(tiny.clock.unit(int(t))) for t in (t_us[0], t_us[-1]))
     lengths = []
     for step in range(30):
-        look, _ = of(made.stretch(step))
+        look, _ = of(made.event_batch(step))
         assert not look.weight.any()
         assert look.time.min() >= begin - 1e-6 and look.time.max() <= end + 1e-6
         lengths.append(float(look.time[0, -1] - look.time[0, 0]) * tiny.clock.span_us)
@@ -207,12 +207,12 @@ def test_single_instants_come_from_the_whole_capture(tiny: Capture):
     closes = tiny.clock.unit(int(exposure.close_us[train].max()))
     times = []
     for step in range(20):
-        batch = made.instant(step, BELIEF)
-        look, sharp = batch["look"], batch["sharp"]
+        batch = made.latent_frame_batch(step, BELIEF)
+        look, sharp = batch["views"], batch["latent_frames"]
         assert isinstance(look, Instants) and isinstance(sharp, Pixels)
         assert sharp.shape == (1, 16, 16, 1) and look.weight.tolist() == [[1.0]]
         assert sharp.open.unique() == look.time
-        wanted = made.sharp.at(int(tiny.clock.us(look.time.double().numpy())[0, 0]), BELIEF)
+        wanted = made.latent[0].at(int(tiny.clock.us(look.time.double().numpy())[0, 0]), BELIEF)
         torch.testing.assert_close(sharp.value[0, :, :, 0], wanted, atol=2e-3, rtol=0)
         times.append(float(look.time))
     assert opens <= min(times) and max(times) <= closes and max(times) - min(times) > 0.6
@@ -221,18 +221,18 @@ def test_single_instants_come_from_the_whole_capture(tiny: Capture):
 @pytest.mark.parametrize("part", [5, 16, 99])
 def test_parts_cut_everything_alike(tiny: Capture, part: int):
     side = min(part, 16)
-    alone, cut = looks(tiny, part=part, sharp=0.0), looks(tiny, part=part)
+    alone, cut = looks(tiny, crop=part, latent_weight=0.0), looks(tiny, crop=part)
     corners = set()
     for step in range(12):
-        for name, made in (("frames", alone), ("sharp", cut), ("events", cut)):
-            found = made.exposure(step, events=True, sensor_estimate=BELIEF)
-            look, seen = found["look"], found[name]
+        for name, made in (("frames", alone), ("latent_frames", cut), ("events", cut)):
+            found = made.exposure_batch(step, BELIEF, events=True)
+            look, seen = found["views"], found[name]
             assert isinstance(look, Instants) and look.size == (side, side)
             left, top = look.corner[0, 0].tolist()
             corners.add((left, top))
             xy = {
                 "frames": seen.xy[0],
-                "sharp": seen.xy[0, :, :, 1],
+                "latent_frames": seen.xy[0, :, :, 1],
                 "events": seen.xy[0, 1, ..., 0, :],
             }[name]
             assert xy.shape[:2] == (side, side)
@@ -244,16 +244,16 @@ def test_parts_cut_everything_alike(tiny: Capture, part: int):
                 torch.testing.assert_close(seen.value[0], wanted)
     assert len(corners) > 5 if side < 16 else corners == {(0, 0)}
     if side == 16:
-        whole = looks(tiny).exposure(3, events=True, sensor_estimate=BELIEF)
-        assert same(whole, cut.exposure(3, events=True, sensor_estimate=BELIEF))
+        whole = looks(tiny).exposure_batch(3, BELIEF, events=True)
+        assert same(whole, cut.exposure_batch(3, BELIEF, events=True))
 
 
 def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
     def drawn(made: ViewSampler, step: int) -> list[Batch]:
         return [
-            made.instant(step, BELIEF),
-            made.exposure(step, events=True, sensor_estimate=BELIEF),
-            made.stretch(step),
+            made.latent_frame_batch(step, BELIEF),
+            made.exposure_batch(step, BELIEF, events=True),
+            made.event_batch(step),
         ]
 
     first, again, other = looks(tiny, 7), looks(tiny, 7), looks(tiny, 8)
@@ -265,21 +265,21 @@ def test_a_look_depends_on_seed_and_step_alone(tiny: Capture):
 
 
 def test_behind_a_colour_filter_every_pixel_has_three_measurements():
-    made = looks(coloured(), instants=2)
-    _, events = of(made.exposure(1, events=True, sensor_estimate=BELIEF))
+    made = looks(coloured(), grad_views=2)
+    _, events = of(made.exposure_batch(1, BELIEF, events=True))
     assert events is not None and events.shape == (1, 2, 12, 16, 3)
     assert events.channel is not None and events.channel[0, 1, 5, 6].tolist() == [0, 1, 2]
     moved = events.positive - events.negative
     seen = [float(moved[..., colour].sum()) for colour in range(3)]
     assert len(set(seen)) == 3, "each colour has events of its own"
-    sharp = made.instant(0, BELIEF)["sharp"]
+    sharp = made.latent_frame_batch(0, BELIEF)["latent_frames"]
     assert isinstance(sharp, Pixels) and sharp.value.shape == (1, 12, 16, 1, 3)
 
 
 def test_sharp_images_follow_what_is_believed(tiny: Capture):
     made = looks(tiny)
     usual, *others = (
-        made.instant(4, sensor_estimate)["sharp"]
+        made.latent_frame_batch(4, sensor_estimate)["latent_frames"]
         for sensor_estimate in (
             BELIEF,
             SensorEstimate(0.2, 0.2, 5_000),
@@ -293,20 +293,20 @@ def test_sharp_images_follow_what_is_believed(tiny: Capture):
 
 def test_photos_of_unknown_motion_have_no_sharp_images(tiny: Capture):
     unknown = replace(tiny, known=replace(tiny.known, motion="unknown"))
-    assert looks(tiny).sharp is not None and looks(unknown).sharp is None
+    assert looks(tiny).latent and not looks(unknown).latent
 
 
 def test_a_frame_of_no_length_is_one_view(tiny: Capture):
     sharp = replace(tiny, split=replace(tiny.split, train=tiny.split.test, test=tiny.split.train))
-    batch = looks(sharp, instants=5, windows=0.0, sharp=0.0).exposure(
-        0, events=False, sensor_estimate=BELIEF
+    batch = looks(sharp, grad_views=5, event_weight=0.0, latent_weight=0.0).exposure_batch(
+        0, BELIEF, events=False
     )
-    assert batch["look"].shape == (1, 1)
+    assert batch["views"].shape == (1, 1)
 
 
 def test_what_cannot_be_learned_from_is_refused(tiny: Capture):
     with pytest.raises(CaptureError, match="learns from frames"):
-        looks(tiny.without(frames=True), windows=0.0)
+        looks(tiny.without(frames=True), event_weight=0.0)
     held_out = replace(tiny, split=replace(tiny.split, train=tiny.split.train[:0]))
     with pytest.raises(CaptureError, match="no frame is left to learn from"):
         looks(held_out)

@@ -15,6 +15,7 @@ from sharpfield.core.tone import tone_of
 from sharpfield.events.double_integral import latent
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
+from sharpfield.sampling.event_windows import with_events_of
 
 MOST_IMAGES = 200
 """Full precision takes 4 bytes a value: these are 0.7 GB at 640x480."""
@@ -94,9 +95,13 @@ def sharp_light_images(
     """The linear light of some frames, one after the other, see `sharp_images`."""
     frames = capture.needed_frames
     tone = tone_of(frames.encoding)
-    blurred = not frames.exposure.instant[chosen].all()
-    motion = EventMotion.of(capture) if blurred and capture.events is not None else None
+    motions: dict[int, EventMotion] = {}  # of the cameras with events, by track
+    if capture.events is not None and not frames.exposure.instant[chosen].all():
+        for track in np.unique(frames.track[chosen]).tolist():
+            if track < capture.events.tracks:
+                motions[track] = EventMotion.of(with_events_of(capture, track))
     for i in chosen:
+        motion = motions.get(int(frames.track[i]))
         stored = torch.from_numpy(frames.images[i].astype(np.float32)) / frames.white
         image = tone.decode(stored)
         if motion is not None and not frames.exposure.instant[i]:

@@ -1,10 +1,14 @@
-"""Where in space something that moves can be at a moment, as the events of still cameras tell.
+"""Visual hulls: where in space something that moves can be, from the silhouettes of static cameras.
 
-A pixel's events add up to how its light differs from that of the first instant. The level where it
-stays longest is its *usual* one: that of what stands still. Wherever it is further from it than is
-left over between two events, something else is seen: at a moment, these pixels are the
-*silhouette* of what moves. A place that a camera sees outside the silhouette is empty, or filled by
-something that stands still.
+A *silhouette* is the set of pixels of a static camera that see something that moves. A cell of
+space that a camera sees outside its silhouette is empty, or holds something static. A cell belongs
+to the hull if enough cameras see it within their silhouettes.
+
+There are two ways to silhouettes. *Levels* work at any instant: a pixel's events add up to how its
+light differs from that of the first instant. The level where it stays longest is its *usual* one:
+that of the static scene. Wherever it is further from it than what is left over between two events,
+it sees something else. *Activity* works for windows of time, and with frames: where there are
+events, or where a frame differs from the median of its camera's frames.
 
 Source: visual hulls, Laurentini (PAMI 1994), with silhouettes from events.
 """
@@ -19,22 +23,35 @@ from torch import Tensor
 from torch.nn import functional
 
 from sharpfield.core.capture import Capture
+from sharpfield.events.image import window_image
 from sharpfield.events.index import EventIndex
 from sharpfield.events.threshold import thresholds_of
+from sharpfield.geometry.trajectory import count_tracks
 
 BETWEEN = 4
-"""Instants looked at from one moment to the next."""
+"""Silhouettes from one moment of the hull to the next."""
 
 USUAL_SHARE = 0.3
 """Pixels that are at their usual level for less of the time may always see what moves."""
 
 HOLES = 1 / 32
-"""Holes in silhouettes are closed up to twice this share of the image: what moves may look like
+"""Holes in silhouettes are closed up to twice this fraction of the image: what moves may look like
 what is behind it."""
 
 DISSENT = (4, 8)
 """Of so many cameras, one may be wrong about where something can be, and about where it is: what
-never leaves a pixel looks as if it stood still."""
+never leaves a pixel looks static."""
+
+ACTIVE_DISSENT = 5
+"""The same of silhouettes by activity."""
+
+CHANGED = 0.08
+"""Difference of stored values from the median of a camera's frames that makes a pixel active."""
+
+CELLS = 48
+"""Cells of the hull of a window, along each axis of the box."""
+
+SPACING = 2 / CELLS
 
 
 @dataclass(frozen=True)
@@ -47,8 +64,8 @@ class Hull:
     """It most likely is there."""
 
 
-def hull(capture: Capture, index: EventIndex, cells: int, moments: int) -> Hull | None:
-    """What cameras that stand still tell; None if there is none that reported anything.
+def visual_hull(capture: Capture, index: EventIndex, cells: int, moments: int) -> Hull | None:
+    """The hull at each moment by levels; None if no static camera reported anything.
 
     Args:
         capture: In a world where the box is around what the cameras look at.
@@ -66,7 +83,8 @@ def hull(capture: Capture, index: EventIndex, cells: int, moments: int) -> Hull 
         silent = index.offset[sites[0]] == index.offset[sites[-1] + 1]
         if silent or capture.trajectory.known_us(track) is not None:
             continue  # a camera that moves sees events everywhere
-        inside, pixel, reach = _look_up(capture, track, points, 2 / (cells - 1))
+        inside, pixel, depth = _project(capture, track, points)
+        reach = _width_px(capture, depth, 2 / (cells - 1))
         drawn = silhouettes(capture, index, track, BETWEEN * (moments - 1) + 1)
         wide = functional.max_pool3d(
             drawn[None].float(),
@@ -79,18 +97,76 @@ def hull(capture: Capture, index: EventIndex, cells: int, moments: int) -> Hull 
             count += inside & ~present[::BETWEEN].flatten(1)[:, pixel]
     if not seen.any():
         return None
-    enough = seen >= min(2, int(seen.max()))
     possible, solid = (
-        (enough & (count <= seen // every)).view(moments, cells, cells, cells)
+        _agreed(seen, count, min(2, int(seen.max())), every).view(moments, cells, cells, cells)
         for count, every in zip(outside, DISSENT, strict=True)
     )
     return Hull(possible, solid & possible)
 
 
+def moving_cells(
+    capture: Capture, index: EventIndex | None, window: tuple[float, float]
+) -> Float[Tensor, "n 3"] | None:
+    """Centres of the cells where something moves in a window of time, by activity.
+
+    Args:
+        capture: In a world whose box from -1 to 1 holds what moves.
+        index: Of its events, if it has any.
+        window: 0...1.
+
+    Returns:
+        None if no static camera can tell.
+    """
+    points = box_cells()
+    seen, outside = torch.zeros(len(points)), torch.zeros(len(points))
+    for track in range(count_tracks(capture.trajectory)):
+        active = active_pixels(capture, index, track, window)
+        if active is None:
+            continue
+        inside, pixel, _ = _project(capture, track, points)
+        seen += inside
+        outside += inside & ~active.flatten()[pixel]
+    kept = (seen > 0) & _agreed(seen, outside, float(seen.max()) / 2, ACTIVE_DISSENT)
+    return points[kept] if kept.any() else None
+
+
+def box_cells() -> Float[Tensor, "n 3"]:
+    """Centres of all cells of the box from -1 to 1."""
+    along = (torch.arange(CELLS) + 0.5) * SPACING - 1
+    return torch.stack(torch.meshgrid(along, along, along, indexing="ij"), -1).view(-1, 3)
+
+
+def active_pixels(
+    capture: Capture, index: EventIndex | None, track: int, window: tuple[float, float]
+) -> Bool[Tensor, "h w"] | None:
+    """The silhouette of a static camera by activity; None if it moves itself, or cannot tell."""
+    if capture.trajectory.known_us(track) is not None:
+        return None
+    camera = capture.camera
+    start, end = (int(capture.clock.us(time)) for time in window)
+    active = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    if index is not None and track < index.tracks:
+        size = {"width": camera.width, "height": camera.height}
+        active |= torch.from_numpy(window_image(index, start, end, track=track, **size).sum(-1) > 0)
+    if capture.frames is not None:
+        frames, train = capture.frames, capture.split.train
+        own = train[frames.track[train] == track]
+        middle = frames.exposure.middle_us[own]
+        among = own[(middle >= start) & (middle <= end)]
+        if len(among) and len(own) > 2:
+            images = frames.images[among].astype(np.float32)
+            usual = np.median(frames.images[own], 0)
+            differs = np.abs(images - usual).max(-1).max(0) > CHANGED * frames.white
+            active |= torch.from_numpy(differs)
+    if not active.any():
+        return None
+    return functional.max_pool2d(active[None].float(), 3, stride=1, padding=1)[0] > 0
+
+
 def silhouettes(
     capture: Capture, index: EventIndex, track: int, instants: int
 ) -> Bool[Tensor, "t h w"]:
-    """Pixels of a still camera that see what moves, at instants evenly spread over the capture."""
+    """Silhouettes of a static camera by levels, at instants evenly spread over the capture."""
     level = _levels(capture, index, track, instants)
     count = np.arange(len(level))
     each = np.zeros((len(level), int(level.max()) + 3), np.int32)  # one to spare at both ends
@@ -123,10 +199,10 @@ def _levels(
     return level - level.min()
 
 
-def _look_up(
-    capture: Capture, track: int, points: Float[Tensor, "n 3"], spacing: float
-) -> tuple[Bool[Tensor, "n"], Int64[Tensor, "n"], int]:
-    """Whether a camera sees points, in which pixels, and how many pixels a spacing is wide."""
+def _project(
+    capture: Capture, track: int, points: Float[Tensor, "n 3"]
+) -> tuple[Bool[Tensor, "n"], Int64[Tensor, "n"], Float[Tensor, "n"]]:
+    """Whether a static camera sees points, in which pixels (row by row), and at which depth."""
     camera = capture.camera
     pose = capture.trajectory.pose(torch.zeros(()), torch.tensor(track)).detach().float()
     local = (points - pose[:, 3]) @ pose[:, :3]
@@ -135,6 +211,16 @@ def _look_up(
     inside = (depth > 0) & (column >= 0) & (column < camera.width)
     inside &= (row >= 0) & (row < camera.height)
     pixel = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
+    return inside, pixel, depth
+
+
+def _width_px(capture: Capture, depth: Float[Tensor, "n"], spacing: float) -> int:
+    """How many pixels a spacing is wide at the median depth."""
     middle = float(depth.median().clamp_min(1e-6))
-    reach = max(math.ceil(spacing / middle * max(camera.fx_px, camera.fy_px)), 1)
-    return inside, pixel, reach
+    camera = capture.camera
+    return max(math.ceil(spacing / middle * max(camera.fx_px, camera.fy_px)), 1)
+
+
+def _agreed(seen: Tensor, outside: Tensor, least: int | float, every: int) -> Bool[Tensor, "*b n"]:
+    """Cells that enough cameras see, all but one of `every` within their silhouettes."""
+    return (seen >= least) & (outside <= seen // every)

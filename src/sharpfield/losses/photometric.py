@@ -19,6 +19,11 @@ def mse(predicted: Float[Tensor, "*b c"], measured: Float[Tensor, "*b c"]) -> Fl
     return (predicted - measured).square().mean()
 
 
+def l1(predicted: Float[Tensor, "*b c"], measured: Float[Tensor, "*b c"]) -> Float[Tensor, ""]:
+    """Mean absolute difference over pixels and channels."""
+    return (predicted - measured).abs().mean()
+
+
 def relative_depth_error(
     predicted: Float[Tensor, "*b"], measured: Float[Tensor, "*b"]
 ) -> Float[Tensor, ""]:

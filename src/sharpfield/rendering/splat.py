@@ -62,7 +62,11 @@ class Splatting:
     antialiased: bool = True
 
     def __call__(
-        self, cloud: Cloud, views: Views, shift: Float[Tensor, "v n 2"] | None = None
+        self,
+        cloud: Cloud,
+        views: Views,
+        shift: Float[Tensor, "v n 2"] | None = None,
+        drift: Float[Tensor, "n 3"] | None = None,
     ) -> Radiance:
         """Linear light of whole views.
 
@@ -70,6 +74,7 @@ class Splatting:
             cloud: What is drawn.
             views: `[m, k]`: the k views that explain each of m measurements.
             shift: Moves splats in pixels, see `ops.rasterizer`; v = m k.
+            drift: How far Gaussians move while a rolling shutter reads an image, see `row_shift`.
 
         Returns:
             Radiance `[m, h, w, k]`.
@@ -91,7 +96,7 @@ class Splatting:
             canvas, where = flat.canvas(corner, views.size, antialiased=self.antialiased)
         if views.rows is not None:
             rows = views.rows.reshape(m * k, -1, 3, 4)
-            late = row_shift(cloud.means, poses, rows, self.camera, canvas.camera)
+            late = row_shift(cloud.means, poses, rows, self.camera, canvas.camera, drift)
             shift = late if shift is None else shift + late
         drawn = rasterize(
             cloud.means,

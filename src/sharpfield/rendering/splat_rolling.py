@@ -25,6 +25,7 @@ def row_shift(
     rows: Float[Tensor, "v q 3 4"],
     camera: Camera,
     flat: Camera,
+    drift: Float[Tensor, "n 3"] | None = None,
 ) -> Float[Tensor, "v n 2"]:
     """How far splats lie, in pixels, from where they would be if all rows were read at once.
 
@@ -34,9 +35,14 @@ def row_shift(
         rows: From the first row to the last, evenly in time.
         camera: Whose rows are read one after the other.
         flat: The pinhole camera that draws.
+        drift: How far each mean itself moves from the first row to the last; it passes through
+            `means` at the middle row. None for static Gaussians.
     """
     last = rows.shape[1] - 1
     still = _seen_from(means, pose[:, None])[:, 0]
+    if drift is not None:
+        place = torch.linspace(-0.5, 0.5, rows.shape[1], device=means.device, dtype=means.dtype)
+        means = means + place[:, None, None] * drift  # [q, n, 3]
     seen = _seen_from(means, rows)  # [v q n 3]
     at, visible = still, still[..., 2] > NEAR
     for _ in range(ROUNDS):
@@ -54,7 +60,7 @@ def row_shift(
 
 
 def _seen_from(
-    means: Float[Tensor, "n 3"], poses: Float[Tensor, "v q 3 4"]
+    means: Float[Tensor, "*r n 3"], poses: Float[Tensor, "v q 3 4"]
 ) -> Float[Tensor, "v q n 3"]:
     """In the axes of cameras."""
     return (means - poses[..., None, :, 3]) @ poses[..., :3]

@@ -184,7 +184,7 @@ class Run:
                 got=f"the recipe {self.config.name}",
                 do="export a run of one of the splat recipes; `sharpfield recipes` lists them",
             )
-        gaussians = model.scene.gaussians
+        gaussians = model.scene.static
         antialiased = ("antialiased",) if model.scene.splatting.antialiased else ()
         export_splats(
             gaussians,

@@ -1,100 +1,96 @@
-"""What the steps of a splat recipe look at: whole images at a few instants.
+"""View sampling for recipes on Gaussians: whole views of one or several cameras at a few instants.
 
-A *look* is the instants whose views a step draws, with what was measured of them: the blurred frame
-of an exposure, the sharp images that events make of it, and the *windows*, which are the events
-counted at every pixel between two instants that follow each other. A look at a part of the image
-costs less.
+A batch holds the *instants* whose views a step renders, for each of its cameras, and what was
+measured of them: the blurred frame of an exposure, *latent frames* (sharp images by the event
+double integral), and *windows*: the events counted at every pixel from one instant to the next.
+All cameras of a batch look at the same instants, so that moving Gaussians are placed once for all.
+A *crop* of the image makes a step cheaper.
 """
 
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float64, Int64
-from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
+from sharpfield.core.measurements import Batch
 from sharpfield.core.seed import number, numpy_generator
-from sharpfield.events.counts import counts_between
 from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
-from sharpfield.events.motion import EventMotion
-from sharpfield.events.ramps import phase_at
 from sharpfield.ops.permutation import shuffled
-from sharpfield.sampling.measured_depth import MeasuredDepth
-from sharpfield.storage.event_cache import event_index
-
-ROUNDED = 0.5
-"""Events that a count may be off by at an end where the phase of the pixel is unknown."""
-
-Times = Int64[np.ndarray, "_"]
+from sharpfield.sampling.event_windows import Times, camera_events
+from sharpfield.sampling.view_measurements import Crop, Tracks, ViewMeasurements
 
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """What a step looks at, and how each part of it counts.
+    """Which views a step renders, and how much each kind of measurement counts.
 
-    Where events can make sharp images, *early* steps look at one instant, drawn from the whole
-    capture: cheap, and from everywhere. *Late* steps look at one exposure.
+    Where events give latent frames, steps of the *EDI phase* render one instant of the whole
+    capture: cheap, and from everywhere. Later steps render one exposure.
     """
 
     blur: Literal["none", "motion"] = "motion"
-    """Frames are taken as sharp, or as the mean of light along the motion of the camera: the
-    capture's own, or one learned for each frame where it is not known."""
-    instants: int = 3
-    """Views of an exposure through which the scene learns."""
-    draws: int = 3
-    """Views drawn for each of those: light adds up over many, a gradient can do with few."""
-    early: float = 0.6
-    """Part of the schedule that looks at single instants, if events can make sharp images."""
-    still: float = 0.0
-    """Part of the schedule that takes frames as if they were sharp: a view instead of several."""
-    sharp: float = 0.05
-    """Weight of the sharp images from events in late steps; in early ones it is 1. 0 leaves them
-    out altogether."""
-    windows: float = 0.03
-    """Weight of the squared error of the number of events between instants; 0 leaves them out."""
-    fading: float = 0.03
-    """What is left of `sharp` and `windows` at the end of the schedule, if there are frames; they
-    fall while Gaussians settle. Events soon tell what is sharp, but are noisy and late in the dark,
-    and no two pixels have the same threshold: in the end, blurred frames are nearer the truth."""
-    shortest_us: int = 2_000
+    """`none` takes frames as sharp; `motion` as the mean of light along the motion of the camera:
+    the capture's own, or one learned for each frame where it is not known."""
+    cameras: int = 1
+    """Most cameras of one step; all at the same instants."""
+    views: int = 9
+    """Views over an exposure whose mean is compared with the blurred frame; rounded up to a
+    multiple of `grad_views`."""
+    grad_views: int = 3
+    """How many of them the scene learns through; the others are rendered without gradient. Also
+    the views of a batch of events alone."""
+    edi_phase: float = 0.6
+    """Part of the schedule that compares latent frames at single instants, where events give
+    them."""
+    sharp_warmup: float = 0.0
+    """Part of the schedule that takes frames as if they were sharp: one view instead of several."""
+    latent_weight: float = 0.05
+    """Weight of latent frames beside a blurred frame; alone it is 1. 0 makes none."""
+    latent_pairs: bool = False
+    """Where all frames are sharp: after the EDI phase, compare latent frames at two instants and
+    the events between them instead of frames. Shows all times of a moving scene."""
+    event_weight: float = 0.03
+    """Weight of the squared error of the number of events in windows; 0 leaves them out."""
+    event_only_weight: float | None = None
+    """The same for a capture without frames; None takes `event_weight`."""
+    final_event_weight: float = 0.03
+    """Factor on `latent_weight` and `event_weight` at the end of the schedule, if there are blurred
+    frames; it falls from 1 after growth has ended. Events soon tell what is sharp, but are noisy
+    and late in the dark, and no two pixels have the same threshold: in the end, blurred frames are
+    nearer the truth."""
+    min_window_us: int = 2_000
     """Least length of a window that begins or ends outside an exposure."""
-    longest_us: int = 50_000
-    """Most length of a stretch of events."""
-    depth: float = 0.0
-    """Weight of what a depth camera measured, in late steps."""
-    quality: Literal["even", "auto", "images", "events"] = "even"
-    """Which frames are looked at more often: none; those that events, or else images, say are
+    max_window_us: int = 50_000
+    """Most length of all windows of a batch of events alone."""
+    depth_weight: float = 0.0
+    """Weight of measured depth, after the EDI phase."""
+    frame_quality: Literal["even", "auto", "images", "events"] = "even"
+    """Which frames are drawn more often: none; those that events, or else images, show to be
     sharp; those that look sharp; those with few events during the exposure."""
-    part: int = 0
-    """Side of the square part of the image that a step looks at, in pixels; 0 takes the image."""
+    crop: int = 0
+    """Side of the square crop of the image that a step renders, in pixels; 0 takes the image."""
 
-
-@dataclass(frozen=True)
-class Part:
-    """A part of the image, in pixels."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    def of(self, image: Tensor) -> Tensor:
-        """That part of `[h, w, ...]`."""
-        return image[self.top : self.top + self.height, self.left : self.left + self.width]
+    def events_weight(self, capture: Capture) -> float:
+        """The weight of windows of events on a capture, with or without frames."""
+        if capture.frames is None and self.event_only_weight is not None:
+            return self.event_only_weight
+        return self.event_weight
 
 
 class ViewSampler:
-    """Draws looks, each as a function of the seed and the step.
+    """Draws the batch of a step as a function of the seed and the step.
 
     Args:
-        options: What they are made of.
-        capture: In the model's space.
+        options: What batches are made of.
+        capture: In the model's space; events of a rolling shutter on the clock of its first row.
         seed: Of the run.
+        steps: Length of the schedule.
         weights: How often each training frame is drawn; all alike by default.
+        separate_events: Events get steps of their own beside frames. Needed where their clock may
+            be late by an unknown time, which views at the frames' instants cannot tell.
     """
 
     def __init__(
@@ -102,235 +98,229 @@ class ViewSampler:
         options: SamplingOptions,
         capture: Capture,
         seed: int,
+        *,
+        steps: int,
         weights: Float64[np.ndarray, "n"] | None = None,
+        separate_events: bool = False,
     ) -> None:
-        self.options, self.capture, self.seed = options, capture, seed
-        self.weights = weights
-        frames, events = capture.frames, capture.events
-        if frames is None and options.windows == 0 or events is None and frames is None:
-            raise CaptureError(
-                "this recipe learns from frames, and there are none",
-                where=capture.name,
-                do="train event-splat, which learns from events alone",
-            )
-        if frames is not None and not len(capture.split.train):
-            raise CaptureError(
-                "no frame is left to learn from",
-                where=capture.name,
-                got="all are held out",
-                do="hold out fewer, or none (--hold-out none)",
-            )
-        self.motion = self.sharp = None
-        if events is not None and (frames is None or options.windows > 0 or options.sharp > 0):
-            self.motion = EventMotion.of(capture)
-        self.index = None
-        if self.motion is not None and self.motion.channel is None:
-            events = self.motion.events
-            self.index = None if events.rectified else event_index(events)
-        known = capture.known.motion != "unknown"
-        if self.motion is not None and frames is not None and options.sharp > 0 and known:
-            self.sharp = SharpInstants(capture, self.motion, self.index)
-        self.depth = None
-        if options.depth > 0 and capture.depth is not None:
-            self.depth = MeasuredDepth(capture.depth, capture.camera)
+        self.options, self.capture, self.seed, self.weights = options, capture, seed, weights
+        _check(options, capture)
+        frames = capture.frames
+        counted = options.events_weight(capture) > 0
+        self.cameras = {}
+        if capture.events is not None and (counted or options.latent_weight > 0):
+            self.cameras = camera_events(capture, latent=options.latent_weight > 0)
+        with_frames = [] if frames is None else np.unique(frames.track[capture.split.train])
+        both = all(int(track) in self.cameras for track in with_frames)
+        self.latent: dict[int, SharpInstants] = {}
+        if both:
+            self.latent = {t: own.latent for t, own in self.cameras.items() if own.latent}
+        self.edi_until = int(options.edi_phase * steps) if self.latent else 0
+        self.sharp_until = int(options.sharp_warmup * steps)
+        self.counted = bool(self.cameras) and counted
+        self.joint_events = self.counted and both and not separate_events
+        self.separate_events = self.counted and not self.joint_events
+        sharp = frames is not None and bool(frames.exposure.instant[capture.split.train].all())
+        self.pairs = options.latent_pairs and sharp and bool(self.latent) and self.joint_events
+        self.depth = options.depth_weight > 0 and capture.depth is not None
+        self.measured = ViewMeasurements(capture, self.cameras)
 
-    def instant(self, step: int, sensor_estimate: SensorEstimate) -> Batch:
-        """A single view of a sharp image, anywhere between the first and the last exposure."""
-        assert self.sharp is not None
+    def draw(self, step: int, sensor: SensorEstimate) -> Batch:
+        """The batch of a step.
+
+        Args:
+            step: Of the schedule.
+            sensor: What is known of the event camera by now; latent frames are made with it.
+        """
+        if step < self.edi_until:
+            return self.latent_frame_batch(step, sensor)
+        if self.capture.frames is None or (self.separate_events and step % 2):
+            return self.event_batch(step)
+        if self.pairs:
+            return self.latent_pair_batch(step, sensor)
+        sharp = step < self.sharp_until
+        return self.exposure_batch(
+            step, sensor, sharp=sharp, events=self.joint_events and not sharp
+        )
+
+    def latent_frame_batch(self, step: int, sensor: SensorEstimate) -> Batch:
+        """A latent frame of each camera at one instant between the first and last exposure."""
         random = numpy_generator(self.seed, step, "look")
-        times = random.integers(*self.sharp.span_us, size=1, endpoint=True)
-        part, frame = self._part(random), int(self.sharp.order[0])
+        tracks = self._choose(random, np.array(list(self.latent)), self.options.cameras)
+        times = random.integers(*self._latent_span_us(tracks), size=1, endpoint=True)
+        crop = self._crop(random)
         return {
-            "look": self._instants(times, np.ones(1), frame, part),
-            "sharp": self._sharp(times, frame, part, sensor_estimate),
+            "views": self.measured.instants(times, np.ones(1), tracks, crop),
+            "latent_frames": self.measured.latent_frames(times, tracks, crop, sensor),
         }
 
-    def exposure(
-        self, step: int, *, events: bool, sensor_estimate: SensorEstimate, still: bool = False
-    ) -> Batch:
-        """Views of one exposure, or only its middle; and with events of an instant beside it."""
+    def latent_pair_batch(self, step: int, sensor: SensorEstimate) -> Batch:
+        """Latent frames of each camera at two instants, and the events between them."""
         random = numpy_generator(self.seed, step, "look")
-        frames, part = self.capture.needed_frames, self._part(random)
-        frame = self._frame(step)
-        opens, closes = frames.exposure.window(frame)
-        moved = self.options.blur == "motion" and opens < closes and not still
-        few, draws = (self.options.instants, self.options.draws) if moved else (1, 1)
-        times, rest = stratified_times((opens, closes), few, draws, random)
-        weight = np.full(few, 1 / few)
-        windows = events and self.motion is not None and self.options.windows > 0
-        if windows:
-            times, weight = self._with_one_beside(times, weight, (opens, closes), random)
-        batch: Batch = {
-            "look": self._instants(times, weight, frame, part),
-            "frames": self._frame_pixels(frame, part),
+        tracks = self._choose(random, np.array(list(self.latent)), self.options.cameras)
+        times = self._window_times(random, self._latent_span_us(tracks), 2)
+        crop = self._crop(random)
+        return {
+            "views": self.measured.instants(times, np.ones(2), tracks, crop),
+            "latent_frames": self.measured.latent_frames(times, tracks, crop, sensor),
+            "events": self.measured.windows(times, tracks, crop),
         }
-        if len(rest):
-            share = 1 / (few * draws)
-            batch["rest"] = self._instants(rest, np.full(len(rest), share), frame, part)
-        if self.sharp is not None:
-            batch["sharp"] = self._sharp(times, frame, part, sensor_estimate)
-        if windows:
-            batch["events"] = self._windows(times, part)
-        if self.depth is not None:
-            middle = np.abs(times - (opens + closes) / 2) + (weight == 0) * (closes - opens + 1)
-            batch["depth"] = self._depth(frame, int(np.argmin(middle)), part)
+
+    def exposure_batch(
+        self, step: int, sensor: SensorEstimate, *, events: bool, sharp: bool = False
+    ) -> Batch:
+        """Frames of one exposure; with the events to an instant beside it.
+
+        Args:
+            step: Of the schedule.
+            sensor: See `draw`.
+            events: Whether to count the events between instants, too, if there are any.
+            sharp: Take the frames as sharp: one view in the middle of the exposure.
+        """
+        random = numpy_generator(self.seed, step, "look")
+        crop, frames = self._crop(random), self._frames(step, random)
+        tracks = self.capture.needed_frames.track[frames]
+        window_us = opens, closes = self.capture.needed_frames.exposure.window(int(frames[0]))
+        moved = self.options.blur == "motion" and opens < closes and not sharp
+        grad, views = (self.options.grad_views, self.options.views) if moved else (1, 1)
+        times, others = stratified_times(window_us, random, grad_views=grad, views=views)
+        weight = np.full(grad, 1 / grad)
+        if events := events and self.counted:
+            times, weight = self._with_outside(times, weight, window_us, random)
+        batch: Batch = {
+            "views": self.measured.instants(times, weight, tracks, crop),
+            "frames": self.measured.frames(frames, crop),
+        }
+        if len(others):
+            share = np.full(len(others), 1 / (grad + len(others)))
+            batch["no_grad_views"] = self.measured.instants(others, share, tracks, crop)
+        if self.latent:
+            batch["latent_frames"] = self.measured.latent_frames(
+                times, tracks, crop, sensor, frames
+            )
+        if events:
+            batch["events"] = self.measured.windows(times, tracks, crop)
+        if self.depth:
+            from_middle = np.abs(times - (opens + closes) / 2)
+            nearest = int(np.argmin(from_middle + (weight == 0) * (closes - opens + 1)))
+            batch["depth"] = self.measured.depth(frames, nearest, crop)
         return batch
 
-    def stretch(self, step: int) -> Batch:
-        """A stretch of events of any length, cut into windows."""
-        assert self.motion is not None
+    def event_batch(self, step: int) -> Batch:
+        """Events of each camera over a time of any length, cut into windows."""
         random = numpy_generator(self.seed, step, "look")
-        t_us = self.motion.events.t_us
-        begin, end = int(t_us[0]), int(t_us[-1])
-        longest = min(self.options.longest_us, end - begin)
-        length = self.options.shortest_us + random.random() * (longest - self.options.shortest_us)
-        start = begin + random.random() * max(end - begin - length, 0)
-        count = max(self.options.instants, 2)
-        times = np.rint(np.linspace(start, start + length, count)).astype(np.int64)
-        part = self._part(random)
+        t_us = self.capture.needed_events.t_us
+        tracks = self._choose(random, np.array(list(self.cameras)), self.options.cameras)
+        span_us, count = (int(t_us[0]), int(t_us[-1])), max(self.options.grad_views, 2)
+        times = self._window_times(random, span_us, count)
+        crop = self._crop(random)
         return {
-            "look": self._instants(times, np.zeros(count), None, part),
-            "events": self._windows(times, part),
+            "views": self.measured.instants(times, np.zeros(count), tracks, crop),
+            "events": self.measured.windows(times, tracks, crop),
         }
 
-    def _frame(self, step: int) -> int:
-        """Every frame once, in a new order each time; or drawn by quality."""
-        train = self.capture.split.train
+    def _frames(self, step: int, random: np.random.Generator) -> Int64[np.ndarray, "m"]:
+        """A frame, and those of other cameras with the same exposure.
+
+        Every frame comes once before any comes twice, in a new order each time; or more often the
+        higher its quality is.
+        """
+        train, exposure = self.capture.split.train, self.capture.needed_frames.exposure
         if self.weights is not None:
             chance = numpy_generator(self.seed, step, "frames").random()
-            return int(train[np.searchsorted(np.cumsum(self.weights), chance * self.weights.sum())])
-        epoch, place = divmod(step, len(train))
-        drawn = shuffled(
-            np.array([place]), len(train), seed=number(self.seed, 0, "frames"), epoch=epoch
-        )
-        return int(train[drawn[0]])
+            row = np.searchsorted(np.cumsum(self.weights), chance * self.weights.sum())
+        else:
+            epoch, position = divmod(step, len(train))
+            order = number(self.seed, 0, "frames")
+            row = shuffled(np.array([position]), len(train), seed=order, epoch=epoch)[0]
+        first = int(train[row])
+        if self.options.cameras == 1:
+            return np.array([first])
+        opens, closes = exposure.window(first)
+        same = train[(exposure.open_us[train] == opens) & (exposure.close_us[train] == closes)]
+        others = self._choose(random, same[same != first], self.options.cameras - 1)
+        return np.concatenate([[first], others])
 
-    def _with_one_beside(
+    def _choose(
+        self, random: np.random.Generator, among: Int64[np.ndarray, "n"], most: int
+    ) -> Int64[np.ndarray, "m"]:
+        return random.permutation(among)[:most] if len(among) > 1 else among[:most]
+
+    def _latent_span_us(self, tracks: Tracks) -> tuple[int, int]:
+        """From when until when all of some cameras have latent frames."""
+        spans = np.array([self.latent[int(track)].span_us for track in tracks])
+        first = int(spans[:, 0].max())
+        return first, max(int(spans[:, 1].min()), first)
+
+    def _window_times(
+        self, random: np.random.Generator, span_us: tuple[int, int], count: int
+    ) -> Times:
+        """Instants evenly over a time of random length."""
+        begin, end = span_us
+        longest = min(self.options.max_window_us, end - begin)
+        shortest = min(self.options.min_window_us, longest)
+        length = shortest + random.random() * (longest - shortest)
+        start = begin + random.random() * max(end - begin - length, 0)
+        return np.rint(np.linspace(start, start + length, count)).astype(np.int64)
+
+    def _with_outside(
         self,
         times: Times,
-        weight: np.ndarray,
+        weight: Float64[np.ndarray, "k"],
         window_us: tuple[int, int],
         random: np.random.Generator,
-    ) -> tuple[Times, np.ndarray]:
-        """One more instant, before or after the exposure, of no weight in it."""
-        assert self.motion is not None
-        away = self.options.shortest_us + int(random.random() * self.options.longest_us / 2)
-        beside = window_us[0] - away if random.random() < 0.5 else window_us[1] + away
-        t_us = self.motion.events.t_us
-        beside = int(np.clip(beside, t_us[0], t_us[-1]))
-        times, weight = np.append(times, beside), np.append(weight, 0.0)
+    ) -> tuple[Times, Float64[np.ndarray, "l"]]:
+        """One more instant, before or after the exposure, with no weight in its mean."""
+        away = self.options.min_window_us + int(random.random() * self.options.max_window_us / 2)
+        outside = window_us[0] - away if random.random() < 0.5 else window_us[1] + away
+        t_us = self.capture.needed_events.t_us
+        outside = int(np.clip(outside, t_us[0], t_us[-1]))
+        times, weight = np.append(times, outside), np.append(weight, 0.0)
         order = np.argsort(times, kind="stable")
         return times[order], weight[order]
 
-    def _part(self, random: np.random.Generator) -> Part:
+    def _crop(self, random: np.random.Generator) -> Crop:
         width, height = self.capture.camera.size
-        side = self.options.part
+        side = self.options.crop
         if side == 0 or side >= max(width, height):
-            return Part(0, 0, width, height)
+            return Crop(0, 0, width, height)
         wide, high = min(side, width), min(side, height)
         left = int(random.integers(width - wide, endpoint=True))
-        return Part(left, int(random.integers(height - high, endpoint=True)), wide, high)
-
-    def _instants(
-        self, times: Times, weight: np.ndarray, frame: int | None, part: Part
-    ) -> Instants:
-        track = 0 if frame is None else int(self.capture.needed_frames.track[frame])
-        time = torch.from_numpy(self.capture.clock.unit(times)).float()[None]
-        corner = torch.tensor([part.left, part.top]).expand(1, len(times), 2)
-        return Instants(
-            time=time,
-            track=torch.full((1, len(times)), track),
-            weight=torch.from_numpy(weight).float()[None],
-            corner=corner,
-            size=(part.width, part.height),
-        )
-
-    def _frame_pixels(self, frame: int, part: Part) -> Pixels:
-        """The blurred frame `[1, h, w]`."""
-        frames = self.capture.needed_frames
-        image = part.of(torch.from_numpy(np.array(frames.images[frame])))
-        opens, closes = self.capture.frame_time[frame]
-        return self._pixels(
-            (image.to(torch.float32) / frames.white)[None], frame, (opens, closes), part
-        )
-
-    def _depth(self, frame: int, instant: int, part: Part) -> Depths:
-        """What was measured `[1, h, w]`, and at which of the instants."""
-        assert self.depth is not None
-        depth = part.of(torch.from_numpy(self.depth.at(frame)))
-        return Depths(depth[None], torch.full((), instant).expand(1, *depth.shape))
-
-    def _sharp(
-        self, times: Times, frame: int, part: Part, sensor_estimate: SensorEstimate
-    ) -> Pixels:
-        """Sharp images `[1, h, w, k]` at some instants."""
-        assert self.sharp is not None
-        value = torch.stack([part.of(self.sharp.at(int(t), sensor_estimate)) for t in times], 2)[
-            None
-        ]
-        time = torch.from_numpy(self.capture.clock.unit(times)).float()
-        return self._pixels(value, frame, (time, time), part)
-
-    def _pixels(
-        self, value: Tensor, frame: int, window: tuple[Tensor, Tensor], part: Part
-    ) -> Pixels:
-        shape = value.shape[:-1]
-        xy = part.of(self.capture.camera.grid())
-        xy = xy[None, :, :, None] if len(shape) == 4 else xy[None]
-        track = int(self.capture.needed_frames.track[frame])
-        return Pixels(
-            xy=xy.expand(*shape, 2),
-            frame=torch.full((), frame).expand(shape),
-            track=torch.full((), track).expand(shape),
-            open=window[0].expand(shape),
-            close=window[1].expand(shape),
-            value=value,
-        )
-
-    def _windows(self, times: Times, part: Part) -> EventPairs:
-        """Events at every pixel between instants, `[1, k - 1, h, w, c]`.
-
-        On a colour sensor every pixel has one measurement for each of c = 3 colours, interpolated
-        from the pixels that see it.
-        """
-        assert self.motion is not None
-        counted = [
-            counts_between(self.motion, int(start), int(end))
-            for start, end in zip(times[:-1], times[1:], strict=True)
-        ]
-        negative = torch.stack([part.of(darker) for darker, _ in counted])[None]
-        positive = torch.stack([part.of(brighter) for _, brighter in counted])[None]
-        slack = ((negative == 0) & (positive == 0)).float()
-        if self.index is not None:
-            size = {"width": self.motion.events.width, "height": self.motion.events.height}
-            found = [phase_at(self.index, int(time), **size) for time in times]
-            phase = torch.stack([part.of(phase) for phase, _ in found])[None, ..., None]
-            unknown = torch.stack([~part.of(known) for _, known in found])[None, ..., None]
-            negative = negative + phase[:, 1:].clamp_max(0) - phase[:, :-1].clamp_max(0)
-            positive = positive + phase[:, 1:].clamp_min(0) - phase[:, :-1].clamp_min(0)
-            slack = ROUNDED * (unknown[:, 1:].float() + unknown[:, :-1].float())
-        shape = negative.shape
-        time = torch.from_numpy(self.capture.clock.unit(times)).float()[:, None, None, None]
-        xy = part.of(self.capture.camera.grid())[:, :, None]
-        return EventPairs(
-            xy=xy.expand(*shape, 2),
-            track=torch.zeros((), dtype=torch.int64).expand(shape),
-            start=time[:-1].expand(shape),
-            end=time[1:].expand(shape),
-            negative=negative,
-            positive=positive,
-            channel=torch.arange(3).expand(shape) if shape[-1] == 3 else None,
-            slack=slack,
-        )
+        return Crop(left, int(random.integers(height - high, endpoint=True)), wide, high)
 
 
 def stratified_times(
-    window_us: tuple[int, int], few: int, draws: int, random: np.random.Generator
+    window_us: tuple[int, int], random: np.random.Generator, *, grad_views: int, views: int
 ) -> tuple[Times, Times]:
-    """Instants spread evenly over an exposure: `few` that teach, and the rest of `few * draws`."""
+    """Times over an exposure, one in each of equal parts; those with gradient, and the others.
+
+    Args:
+        window_us: When the shutter opens and closes.
+        random: Moves each time within its part, and chooses.
+        grad_views: How many times are for views with gradient: one in each of so many groups.
+        views: How many times in all, rounded up to a multiple of `grad_views`.
+    """
     opens, closes = window_us
-    count = few * draws
+    group = -(-views // grad_views)
+    count = grad_views * group
     place = (np.arange(count) + (random.random(count) if count > 1 else 0.5)) / count
     times = np.rint(opens + (closes - opens) * place).astype(np.int64)
-    chosen = np.arange(few) * draws + random.integers(draws, size=few)
+    chosen = np.arange(grad_views) * group + random.integers(group, size=grad_views)
     return times[chosen], np.delete(times, chosen)
+
+
+def _check(options: SamplingOptions, capture: Capture) -> None:
+    frames = capture.frames
+    if frames is None and options.events_weight(capture) == 0:
+        raise CaptureError(
+            "this recipe learns from frames, and there are none",
+            where=capture.name,
+            do="train event-splat, which learns from events alone",
+        )
+    if frames is not None and not len(capture.split.train):
+        raise CaptureError(
+            "no frame is left to learn from",
+            where=capture.name,
+            got="all are held out",
+            do="hold out fewer, or none (--hold-out none)",
+        )

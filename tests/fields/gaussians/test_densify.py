@@ -3,7 +3,7 @@ import torch
 
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.seed import generator
-from sharpfield.fields.gaussians.densify import DEAD, GradientStats, densify, fade
+from sharpfield.fields.gaussians.densify import PRUNE_OPACITY, GradientStats, densify, reset_opacity
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.training.surgery import rebuild
 
@@ -24,8 +24,8 @@ def scene(scales: list[float], opacities: list[float] | None = None) -> Gaussian
     return made
 
 
-def densified(made: Gaussians, mean_grad: list[float], *, budget: int = 99):
-    return densify(made, torch.tensor(mean_grad), 1.0, budget=budget, generator=chance())
+def densified(made: Gaussians, mean_grad: list[float], *, cap_max: int = 99):
+    return densify(made, torch.tensor(mean_grad), 1.0, cap_max=cap_max, generator=chance())
 
 
 def test_small_ones_are_cloned():
@@ -51,58 +51,58 @@ def test_halves_are_distributed_as_the_whole_was():
     made = scene([LARGE] * 4000)
     made.log_scales.data = torch.tensor([0.09, 0.05, 0.02]).log().repeat(4000, 1)
     made.quaternions.data = torch.tensor([1.0, 0.0, 0.0, 1.0]).repeat(4000, 1)  # x becomes y
-    growth = densified(made, [1.0] * 4000, budget=9999)
+    growth = densified(made, [1.0] * 4000, cap_max=9999)
     assert growth is not None
     offset = growth.values["means"] - made.means.detach()[growth.source]
     torch.testing.assert_close(offset.std(0), torch.tensor([0.05, 0.09, 0.02]), rtol=0.05, atol=0)
 
 
 def test_the_transparent_and_the_huge_are_dropped():
-    made = scene([SMALL, SMALL, HUGE], [0.5 * DEAD, 0.5, 0.5])
+    made = scene([SMALL, SMALL, HUGE], [0.5 * PRUNE_OPACITY, 0.5, 0.5])
     growth = densified(made, [1.0, 0.0, 1.0])
     assert growth is not None and growth.source.tolist() == [1]
 
 
-def test_the_budget_goes_to_those_that_wish_most():
-    growth = densified(scene([SMALL, LARGE, SMALL, SMALL]), [1.0, 3.0, 2.0, 0.0], budget=6)
+def test_those_of_the_largest_gradient_come_first_up_to_the_maximum():
+    growth = densified(scene([SMALL, LARGE, SMALL, SMALL]), [1.0, 3.0, 2.0, 0.0], cap_max=6)
     assert growth is not None
     assert growth.source.tolist() == [0, 2, 3, 2, 1, 1]
-    full = densified(scene([SMALL] * 3), [1.0] * 3, budget=3)
+    full = densified(scene([SMALL] * 3), [1.0] * 3, cap_max=3)
     assert full is None
 
 
 def test_content_gaussians_stay_as_they_are():
     assert densified(scene([SMALL, LARGE]), [1e-4, 1e-4]) is None
-    assert densify(scene([]), torch.zeros(0), 1.0, budget=9, generator=chance()) is None
+    assert densify(scene([]), torch.zeros(0), 1.0, cap_max=9, generator=chance()) is None
 
 
-def test_a_watch_averages_over_the_views_that_saw_a_splat():
-    watch = GradientStats(3)
+def test_gradients_are_averaged_over_the_views_that_saw_a_splat():
+    stats = GradientStats(3)
     pull = torch.zeros(2, 3, 2)
     pull[0, 0], pull[1, 0], pull[1, 1] = (
         torch.tensor([0.03, 0.04]),
         torch.tensor([0.06, 0.08]),
         torch.tensor([0.3, 0.4]),
     )
-    watch.note(pull, (200, 200))
-    torch.testing.assert_close(watch.mean_grad, torch.tensor([7.5, 50.0, 0.0]))
-    watch.note(pull[:1] * 3, (200, 200))
-    torch.testing.assert_close(watch.mean_grad, torch.tensor([10.0, 50.0, 0.0]))
+    stats.add(pull, (200, 200))
+    torch.testing.assert_close(stats.mean_grad, torch.tensor([7.5, 50.0, 0.0]))
+    stats.add(pull[:1] * 3, (200, 200))
+    torch.testing.assert_close(stats.mean_grad, torch.tensor([10.0, 50.0, 0.0]))
 
 
-def test_a_watch_begins_anew_when_gaussians_grow():
-    made, watch = scene([SMALL, SMALL]), GradientStats(2)
-    assert isinstance(watch, PointSet)
-    watch.note(torch.ones(1, 2, 2), (2, 2))
+def test_statistics_start_again_when_gaussians_grow():
+    made, stats = scene([SMALL, SMALL]), GradientStats(2)
+    assert isinstance(stats, PointSet)
+    stats.add(torch.ones(1, 2, 2), (2, 2))
     growth = densified(made, [1.0, 1.0])
     assert growth is not None
     optimizer = torch.optim.Adam(made.parameters())
     rebuild(made, optimizer, growth)
-    rebuild(watch, optimizer, watch.anew(growth))
-    assert len(made) == len(watch.mean_grad) == 4 and not watch.mean_grad.any()
-    assert set(watch.state_dict()) == {"total", "times"}
-    watch.note(torch.ones(1, 4, 2), (2, 2))
-    torch.testing.assert_close(watch.mean_grad, torch.full((4,), 2**0.5))
+    rebuild(stats, optimizer, stats.cleared(growth))
+    assert len(made) == len(stats.mean_grad) == 4 and not stats.mean_grad.any()
+    assert set(stats.state_dict()) == {"total", "views"}
+    stats.add(torch.ones(1, 4, 2), (2, 2))
+    torch.testing.assert_close(stats.mean_grad, torch.full((4,), 2**0.5))
 
 
 def test_fading_leaves_the_faint_alone_and_their_moments():
@@ -110,7 +110,7 @@ def test_fading_leaves_the_faint_alone_and_their_moments():
     optimizer = torch.optim.Adam(made.parameters())
     made.opacities.sum().backward()
     optimizer.step()
-    growth = fade(made.opacity_logits)
+    growth = reset_opacity(made.opacity_logits)
     rebuild(made, optimizer, growth)
     assert made.opacities.tolist() == pytest.approx([0.006, 0.01], rel=2e-2)
     assert (optimizer.state[made.opacity_logits]["exp_avg"] != 0).tolist() == [True, False]

@@ -13,7 +13,7 @@ EYE = torch.tensor([[0.3, -0.2, -4.0]])
 
 
 def test_what_is_exported_comes_back(tmp_path):
-    scene = made(degree=3)
+    scene = made(sh_degree=3)
     export_splats(scene, tmp_path / "a.ply")
     found = import_splats(tmp_path / "a.ply")
     torch.testing.assert_close(found.rotations, scene.rotations)
@@ -29,7 +29,7 @@ def test_quaternions_are_unit_length_for_viewers_that_do_not_normalise(tmp_path)
 
 def test_a_viewer_shows_linear_light_through_the_display_curve(tmp_path):
     colours = torch.tensor([[0.001, 0.2, 0.9]])
-    scene = Gaussians.start(torch.zeros(1, 3), colours, torch.ones(1), degree=1)
+    scene = Gaussians.start(torch.zeros(1, 3), colours, torch.ones(1), sh_degree=1)
     scene.higher_harmonics.data += 1e-3 * torch.randn(1, 3, 3)
     export_splats(scene, tmp_path / "a.ply", encoding="linear", comments=("antialiased",))
     table = read_splats(tmp_path / "a.ply")
@@ -47,7 +47,7 @@ def test_grey_is_written_as_three_equal_colours(tmp_path):
 
 
 def test_in_another_world_everything_looks_the_same():
-    scene = made(degree=3)
+    scene = made(sh_degree=3)
     turn = rotation_exp(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64)).numpy()
     change = Similarity(2.5, turn, np.array([1.0, -2.0, 0.5]))
     after = moved(scene, change)

@@ -6,11 +6,11 @@ import torch
 from sharpfield.core.points import Growth
 from sharpfield.core.seed import generator
 from sharpfield.fields.gaussians.mcmc import (
-    DEAD,
+    MIN_OPACITY,
     opacity_scale_penalty,
     position_noise,
     relocate_and_add,
-    shared,
+    relocated_opacity_scale,
 )
 from sharpfield.fields.gaussians.static import Gaussians
 
@@ -27,9 +27,9 @@ def crowd(count: int = 40, *, dead: int = 10) -> tuple[torch.Tensor, torch.Tenso
     return scales, opacity.logit()
 
 
-def grown(budget: int = 40, **options) -> tuple[Growth, torch.Tensor, torch.Tensor]:
+def grown(cap_max: int = 40, **options) -> tuple[Growth, torch.Tensor, torch.Tensor]:
     scales, logits = crowd(**options)
-    growth = relocate_and_add(scales, logits, budget=budget, generator=chance())
+    growth = relocate_and_add(scales, logits, cap_max=cap_max, generator=chance())
     assert growth is not None
     return growth, scales, logits
 
@@ -39,7 +39,7 @@ def grown(budget: int = 40, **options) -> tuple[Growth, torch.Tensor, torch.Tens
 def test_sharing_changes_neither_the_centre_nor_the_sum_along_a_line(shares: int, opacity: float):
     """The integral of eq. 9, by brute force."""
     one = torch.tensor([opacity], dtype=torch.float64)
-    new, factor = shared(one, torch.tensor([shares]))
+    new, factor = relocated_opacity_scale(one, torch.tensor([shares]))
     x = torch.linspace(-9, 9, 20_001, dtype=torch.float64)
     alone = one * torch.exp(-(x**2) / 2)
     each = new * torch.exp(-(x**2) / (2 * factor**2))
@@ -53,9 +53,9 @@ def test_sharing_changes_neither_the_centre_nor_the_sum_along_a_line(shares: int
 
 def test_the_sum_over_shares_is_that_of_the_paper():
     opacity = torch.tensor([0.2, 0.7, 0.95], dtype=torch.float64)
-    _, factor = shared(opacity, torch.full((3,), 6))
+    _, factor = relocated_opacity_scale(opacity, torch.full((3,), 6))
     for o, found in zip(opacity.tolist(), factor.tolist(), strict=True):
-        new = max(1 - (1 - o) ** (1 / 6), DEAD)
+        new = max(1 - (1 - o) ** (1 / 6), MIN_OPACITY)
         stopped = 0.0
         for i in range(1, 7):
             for k in range(i):
@@ -68,7 +68,7 @@ def test_the_dead_move_to_the_live_and_their_number_stays():
     assert len(growth) == 40
     assert (growth.source[:10] >= 10).all() and growth.fresh[:10].all()
     assert torch.equal(growth.source[10:], torch.arange(10, 40)) and not growth.fresh[10:].any()
-    assert (growth.values["opacity_logits"].sigmoid() >= 0.99 * DEAD).all()
+    assert (growth.values["opacity_logits"].sigmoid() >= 0.99 * MIN_OPACITY).all()
 
 
 def test_all_who_share_a_place_become_alike_and_others_stay():
@@ -85,21 +85,21 @@ def test_all_who_share_a_place_become_alike_and_others_stay():
     assert torch.equal(new_scales[alone], scales[alone])
 
 
-def test_it_grows_by_a_twentieth_up_to_the_budget():
-    growth, *_ = grown(budget=1000, count=40, dead=0)
+def test_it_grows_by_a_twentieth_up_to_the_maximum():
+    growth, *_ = grown(cap_max=1000, count=40, dead=0)
     assert len(growth) == 42 and growth.fresh.tolist() == [False] * 40 + [True] * 2
-    growth, *_ = grown(budget=41, count=40, dead=0)
+    growth, *_ = grown(cap_max=41, count=40, dead=0)
     assert len(growth) == 41
-    assert relocate_and_add(*crowd(dead=0), budget=40, generator=chance()) is None
+    assert relocate_and_add(*crowd(dead=0), cap_max=40, generator=chance()) is None
     assert (
-        relocate_and_add(*crowd(dead=0), budget=7, generator=chance()) is None
+        relocate_and_add(*crowd(dead=0), cap_max=7, generator=chance()) is None
     )  # none are taken away
 
 
 def test_the_opaque_are_chosen_more_often():
     logits = torch.tensor([0.1, 0.3, 0.6, 0.001]).logit().repeat(500)
     growth = relocate_and_add(
-        torch.zeros(2000, 3), logits, budget=9999, generator=chance(), more=4.0
+        torch.zeros(2000, 3), logits, cap_max=9999, generator=chance(), growth=4.0
     )
     assert growth is not None
     kind = growth.source[growth.fresh] % 4
@@ -108,14 +108,14 @@ def test_the_opaque_are_chosen_more_often():
 
 
 def test_without_anyone_alive_nothing_moves():
-    assert relocate_and_add(*crowd(dead=40), budget=99, generator=chance()) is None
+    assert relocate_and_add(*crowd(dead=40), cap_max=99, generator=chance()) is None
     none = torch.zeros(0)
-    assert relocate_and_add(none.reshape(0, 3), none, budget=99, generator=chance()) is None
+    assert relocate_and_add(none.reshape(0, 3), none, cap_max=99, generator=chance()) is None
 
 
 def test_it_depends_on_its_generator_alone():
-    first, again = (relocate_and_add(*crowd(), budget=99, generator=chance()) for _ in range(2))
-    other = relocate_and_add(*crowd(), budget=99, generator=chance(1))
+    first, again = (relocate_and_add(*crowd(), cap_max=99, generator=chance()) for _ in range(2))
+    other = relocate_and_add(*crowd(), cap_max=99, generator=chance(1))
     assert first is not None and again is not None and other is not None
     assert torch.equal(first.source, again.source) and not torch.equal(first.source, other.source)
 
@@ -130,7 +130,7 @@ def scene(opacity: float, count: int = 4000) -> Gaussians:
 
 
 def test_noise_has_the_square_of_the_gaussians_shape():
-    noise = position_noise(scene(DEAD), 1e-3, chance(), noise=100.0)
+    noise = position_noise(scene(MIN_OPACITY), 1e-3, chance(), noise=100.0)
     wanted = 0.5 * 0.1 * torch.tensor([0.1, 0.3, 0.02]) ** 2  # half open at the threshold itself
     torch.testing.assert_close(noise.std(0), wanted, rtol=0.05, atol=0)
 
@@ -140,9 +140,9 @@ def test_the_opaque_do_not_wander():
     assert position_noise(scene(1e-4), 1e-3, chance()).std() > 0.1
 
 
-def test_idleness():
+def test_the_penalty_on_opacity_and_scale():
     made = scene(0.25)
-    opacity, scale = opacity_scale_penalty(made)
-    assert opacity.item() == pytest.approx(0.25) and scale.item() == pytest.approx(0.42 / 3)
-    (opacity + scale).backward()
+    penalty = opacity_scale_penalty(made)
+    assert penalty.item() == pytest.approx(0.25 + 0.42 / 3)
+    penalty.backward()
     assert made.log_scales.grad is not None and (made.log_scales.grad > 0).all()

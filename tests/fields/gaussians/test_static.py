@@ -8,20 +8,20 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.gaussians.static import Gaussians
 
 
-def made(count: int = 5, *, degree: int = 2, channels: int = 3) -> Gaussians:
+def made(count: int = 5, *, sh_degree: int = 2, channels: int = 3) -> Gaussians:
     chance = generator(0, 0, "gaussians")
 
     def normal(*shape: int) -> torch.Tensor:
         return torch.randn(shape, generator=chance)
 
-    harmonics = 0.2 * normal(count, (degree + 1) ** 2, channels)
+    harmonics = 0.2 * normal(count, (sh_degree + 1) ** 2, channels)
     return Gaussians(normal(count, 3), normal(count, 4), normal(count, 3), normal(count), harmonics)
 
 
 def test_at_the_start_they_have_the_colours_they_are_given_from_everywhere():
     colours = torch.rand(4, 3, generator=generator(0, 0, "colours"))
     points = torch.arange(12.0).reshape(4, 3)
-    scene = Gaussians.start(points, colours, torch.full((4,), 0.1), degree=3)
+    scene = Gaussians.start(points, colours, torch.full((4,), 0.1), sh_degree=3)
     seen = scene.colours(torch.tensor([[0.0, 0.0, -5.0], [9.0, 2.0, 1.0]]))
     torch.testing.assert_close(seen, colours.expand(2, 4, 3))
     torch.testing.assert_close(scene.opacities, torch.full((4,), 0.1))
@@ -63,11 +63,11 @@ def test_colours_agree_with_a_plain_sum():
 
 
 def test_lower_degrees_leave_out_what_is_above():
-    scene, eye = made(degree=2), torch.zeros(1, 3)
-    flat = scene.colours(eye, degree=0)
+    scene, eye = made(sh_degree=2), torch.zeros(1, 3)
+    flat = scene.colours(eye, sh_degree=0)
     torch.testing.assert_close(flat[0], (0.5 + 0.28209479 * scene.base_harmonics[:, 0]).clamp(0))
     scene.higher_harmonics.data[:, 3:] = 0
-    torch.testing.assert_close(scene.colours(eye, degree=1), scene.colours(eye))
+    torch.testing.assert_close(scene.colours(eye, sh_degree=1), scene.colours(eye))
 
 
 def test_gradients():
@@ -101,7 +101,7 @@ def test_grey_and_none_at_all():
 
 
 def test_five_harmonics_are_of_no_degree():
-    with pytest.raises(ValueError, match="no degree has 5 harmonics"):
+    with pytest.raises(ValueError, match="no SH degree has 5 harmonics"):
         Gaussians(
             torch.zeros(1, 3),
             torch.ones(1, 4),

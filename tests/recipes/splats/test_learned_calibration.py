@@ -32,12 +32,12 @@ ALL = LearnedCalibrationOptions(
 NONE = LearnedCalibrationOptions(threshold=(0.3, 0.1))
 
 
-def model(capture: Capture, unknowns: LearnedCalibrationOptions, **looks) -> SplatModel:
+def model(capture: Capture, calibration: LearnedCalibrationOptions, **looks) -> SplatModel:
     recipe = EvSplat(
         steps=100,
-        gaussians=GaussianOptions(budget=300, growth="none"),
-        looks=SamplingOptions(early=0.0, **looks),
-        unknowns=unknowns,
+        gaussians=GaussianOptions(cap_max=300, growth="none"),
+        sampling=SamplingOptions(edi_phase=0.0, **looks),
+        calibration=calibration,
     )
     return recipe.build(capture, 0)
 
@@ -48,8 +48,8 @@ def total(terms: dict[str, Tensor]) -> Tensor:
 
 def batches(made: SplatModel) -> list[Batch]:
     return [
-        made.looks.exposure(2, events=True, sensor_estimate=made.unknowns.sensor_estimate()),
-        made.looks.stretch(3),
+        made.sampler.exposure_batch(2, made.calibration.sensor_estimate(), events=True),
+        made.sampler.event_batch(3),
     ]
 
 
@@ -63,31 +63,34 @@ def test_at_first_what_is_learned_does_nothing(tiny: Capture):
             torch.testing.assert_close(one[name], wanted, rtol=1e-5, atol=1e-8, msg=name)
     time, track = torch.linspace(0, 1, 7), torch.zeros(7, dtype=torch.int64)
     torch.testing.assert_close(learned.path.pose(time, track), fixed.path.pose(time, track))
-    assert torch.equal(learned.unknowns.on_time(time), time) and learned.unknowns.offset_us == 0
-    assert learned.unknowns.guess == fixed.unknowns.guess == (0.3, 0.1)
+    assert (
+        torch.equal(learned.calibration.corrected_time(time), time)
+        and learned.calibration.offset_us == 0
+    )
+    assert learned.calibration.first_thresholds == fixed.calibration.first_thresholds == (0.3, 0.1)
 
 
 def test_everything_that_is_unknown_is_asked(tiny: Capture):
     made = model(tiny, ALL)
     for batch in batches(made):
         total(made.losses(batch, 0)).backward()
-    for name, parameter in (*made.unknowns.named_parameters(), *made.path.named_parameters()):
+    for name, parameter in (*made.calibration.named_parameters(), *made.path.named_parameters()):
         # Steps of the response get gradients once their heights are not zero.
         asked = parameter.grad is not None and bool(parameter.grad.any())
         assert asked or ".steps." in name, name
 
 
 def test_groups_hold_all_of_them_once_at_their_rates(tiny: Capture):
-    made = model(tiny, replace(ALL, rate=0.5, poses_rate=0.25, offset_rate_us=40.0))
+    made = model(tiny, replace(ALL, lr=0.5, poses_lr=0.25, offset_lr_us=40.0))
     groups = {group.name: group for group in made.groups()}
-    assert groups["unknowns"].rate(0) == 0.5 and groups["poses"].rate(0) == 0.25
+    assert groups["calibration"].rate(0) == 0.5 and groups["poses"].rate(0) == 0.25
     assert groups["offset"].rate(0) == 40.0 / OFFSET_UNIT_US
     assert groups["thresholds"].rate(100) == 0.5 and len(groups["thresholds"].parameters) == 1
     assert groups["poses"].rate(100) == pytest.approx(0.25 / 20)
     listed = [id(p) for group in groups.values() for p in group.parameters]
     assert len(listed) == len(set(listed)) and set(listed) == {id(p) for p in made.parameters()}
     plain = {group.name for group in model(tiny, NONE).groups()}
-    assert plain.isdisjoint({"unknowns", "thresholds", "offset", "poses"})
+    assert plain.isdisjoint({"calibration", "thresholds", "offset", "poses"})
 
 
 def test_a_late_clock_is_found_in_the_right_direction(tiny: Capture):
@@ -95,7 +98,7 @@ def test_a_late_clock_is_found_in_the_right_direction(tiny: Capture):
     truth = light_of(model(tiny, replace(NONE, offset=True)))
     for late_us, sign in ((4_000, 1), (-4_000, -1)):
         made = model(tiny, replace(NONE, offset=True))
-        offset = made.unknowns.offset_steps
+        offset = made.calibration.offset_steps
         assert offset is not None
         grow = sum(slope_of(made, truth, offset, late_us, step) for step in range(4))
         assert float(grow) * sign < 0, "going down the slope goes towards the truth"
@@ -105,7 +108,7 @@ def light_of(made: SplatModel) -> SplatModel:
     """A model with colours of strong contrast, to be recorded by made-up events."""
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        own = made.scene.gaussians
+        own = made.scene.static
         own.base_harmonics += 1.5 * torch.randn(own.base_harmonics.shape, generator=generator)
         own.opacity_logits += 3
     return made
@@ -124,11 +127,11 @@ def slope_of(
 ) -> Tensor:
     """Gradient for one parameter on events that a sensor of 0.3 and 0.1 reports of the truth."""
     made.scene.load_state_dict(truth.scene.state_dict())
-    batch = made.looks.stretch(step)
-    look, events = batch["look"], batch["events"]
+    batch = made.sampler.event_batch(step)
+    look, events = batch["views"], batch["events"]
     assert isinstance(look, Instants) and isinstance(events, EventPairs)
     rgb = seen_by(truth, look, late_us).rgb[0].flatten(0, 1)
-    log = truth.unknowns.response(rgb, events[0, 0].reshape(-1))[..., 0]
+    log = truth.calibration.response(rgb, events[0, 0].reshape(-1))[..., 0]
     change = (log[:, 1:] - log[:, :-1]).T.reshape(events.shape)
     negative, positive = change.clamp(max=0) / 0.3, change.clamp(min=0) / 0.1
     exact = torch.zeros_like(positive)
@@ -141,7 +144,7 @@ def test_thresholds_go_towards_those_of_the_sensor(tiny: Capture):
     truth = light_of(model(tiny, NONE))
     for guess, sign in (((0.2, 0.07), 1), ((0.4, 0.14), -1)):
         made = model(tiny, LearnedCalibrationOptions(threshold=guess, thresholds="signs"))
-        thresholds = made.unknowns.thresholds
+        thresholds = made.calibration.thresholds
         assert isinstance(thresholds, LearnedThresholds)
         slope = sum(slope_of(made, truth, thresholds.log_factor, 0, step) for step in range(6))
         assert (torch.as_tensor(slope) * sign < 0).all()
@@ -159,7 +162,7 @@ def test_knots_go_back_to_where_the_camera_was(tiny: Capture):
             made.path.twist += moved
         batch = blurred(
             truth,
-            made.looks.exposure(1, events=False, sensor_estimate=made.unknowns.sensor_estimate()),
+            made.sampler.exposure_batch(1, made.calibration.sensor_estimate(), events=False),
         )
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], made.path.twist)[0]
         assert slope.sum((0, 1))[axis] > 0, "going down the slope undoes the move"
@@ -167,7 +170,7 @@ def test_knots_go_back_to_where_the_camera_was(tiny: Capture):
 
 def blurred(truth: SplatModel, batch: Batch, *, gain: float = 1.0) -> Batch:
     """The look with the frame that a model predicts."""
-    look, frames = batch["look"], batch["frames"]
+    look, frames = batch["views"], batch["frames"]
     assert isinstance(look, Instants) and isinstance(frames, Pixels)
     value = mix(seen_by(truth, look), outer=truth.tone.encode)
     return {**batch, "frames": replace(frames, value=gain * value)}
@@ -177,12 +180,12 @@ def test_a_brighter_exposure_asks_for_a_larger_gain(tiny: Capture):
     truth = light_of(model(tiny, NONE))
     made = model(tiny, replace(NONE, gains=True))
     made.scene.load_state_dict(truth.scene.state_dict())
-    gains = made.unknowns.log_gain
+    gains = made.calibration.log_gain
     assert gains is not None and len(gains) == len(tiny.needed_frames)
     for factor, sign in ((1.2, 1), (0.8, -1)):
         batch = blurred(
             truth,
-            made.looks.exposure(1, events=False, sensor_estimate=made.unknowns.sensor_estimate()),
+            made.sampler.exposure_batch(1, made.calibration.sensor_estimate(), events=False),
             gain=factor,
         )
         frame = int(batch["frames"].frame[0, 0, 0])
@@ -191,12 +194,12 @@ def test_a_brighter_exposure_asks_for_a_larger_gain(tiny: Capture):
 
 
 def test_gains_can_not_all_rise_together(tiny: Capture):
-    unknowns = LearnedCalibration(LearnedCalibrationOptions(gains=True), tiny, 0)
-    assert unknowns.log_gain is not None and unknowns.prior() is not None
-    unknowns.log_gain.data += torch.tensor([0.3, -0.3] * 3)
-    assert float(unknowns.prior().detach()) == pytest.approx(0, abs=1e-12)
-    unknowns.log_gain.data += 0.3
-    assert float(unknowns.prior().detach()) == pytest.approx(0.09)
+    calibration = LearnedCalibration(LearnedCalibrationOptions(gains=True), tiny, 0)
+    assert calibration.log_gain is not None and calibration.prior() is not None
+    calibration.log_gain.data += torch.tensor([0.3, -0.3] * 3)
+    assert float(calibration.prior().detach()) == pytest.approx(0, abs=1e-12)
+    calibration.log_gain.data += 0.3
+    assert float(calibration.prior().detach()) == pytest.approx(0.09)
 
 
 def test_what_is_known_needs_no_prior(tiny: Capture):
@@ -206,17 +209,20 @@ def test_what_is_known_needs_no_prior(tiny: Capture):
 
 def test_thresholds_come_from_the_capture_unless_given(tiny: Capture):
     noted = replace(tiny, known=Known(thresholds=Thresholds(0.31, 0.17)))
-    assert LearnedCalibration(LearnedCalibrationOptions(), noted, 0).guess == (0.31, 0.17)
-    assert LearnedCalibration(NONE, noted, 0).guess == (0.3, 0.1)
+    assert LearnedCalibration(LearnedCalibrationOptions(), noted, 0).first_thresholds == (
+        0.31,
+        0.17,
+    )
+    assert LearnedCalibration(NONE, noted, 0).first_thresholds == (0.3, 0.1)
 
 
 def test_an_offset_is_in_microseconds_of_the_events_clock(tiny: Capture):
-    unknowns = LearnedCalibration(LearnedCalibrationOptions(offset=True), tiny, 0)
-    assert unknowns.offset_steps is not None
-    unknowns.offset_steps.data += 2.5
-    assert unknowns.offset_us == 2500
+    calibration = LearnedCalibration(LearnedCalibrationOptions(offset=True), tiny, 0)
+    assert calibration.offset_steps is not None
+    calibration.offset_steps.data += 2.5
+    assert calibration.offset_us == 2500
     time = torch.tensor([0.5])
-    early = (time - unknowns.on_time(time)) * tiny.clock.span_us
+    early = (time - calibration.corrected_time(time)) * tiny.clock.span_us
     assert early.item() == pytest.approx(2500, rel=1e-4)
 
 

@@ -1,8 +1,8 @@
-"""A scene of Gaussians: ellipsoids of light, each with a place, a shape, an opacity and a colour.
+"""3D Gaussians: ellipsoids with a mean, a rotation, scales, an opacity and a colour.
 
-What is learned is free of bounds: quaternions (w x y z) of any length, the natural log of scales,
-the logit of opacities, and real spherical harmonics of the colour. The *base* harmonics are those
-of degree 0, the same from everywhere; the *higher* ones tell how the colour changes with the
+All parameters are unbounded: quaternions (w x y z) of any length, the natural log of scales, the
+logit of opacities, and real spherical harmonics (SH) of the colour. The *base* harmonics are those
+of SH degree 0, the same in all directions; the *higher* ones tell how the colour changes with the
 direction, and usually learn more slowly. A colour is 0.5 + the sum of its harmonics, and never
 below zero; whether it means light or what frames store is up to the renderer.
 
@@ -21,21 +21,21 @@ from sharpfield.geometry.se3 import rotation_from_quaternion
 from sharpfield.ops.encoding import spherical_harmonics
 
 FLAT = 0.28209479177387814
-"""The harmonic of degree 0, the same in all directions."""
+"""The spherical harmonic of degree 0, the same in all directions."""
 
 GREY = 0.5
 """Colour of a Gaussian whose harmonics are all zero."""
 
 
 class Gaussians(nn.Module):
-    """Gaussians, all of whose parameters have one row for each.
+    """Static Gaussians; every parameter has one row for each.
 
     Args:
         means: In world units.
         quaternions: w x y z, of any length but zero.
         log_scales: Natural log of the three standard deviations, in world units.
         opacity_logits: Log odds of the opacity.
-        harmonics: k = (degree + 1)^2 for each of c = 1 or 3 colours.
+        harmonics: k = (SH degree + 1)^2 for each of c = 1 or 3 colours.
     """
 
     def __init__(
@@ -47,9 +47,9 @@ class Gaussians(nn.Module):
         harmonics: Float[Tensor, "n k c"],
     ) -> None:
         super().__init__()
-        self.degree = math.isqrt(harmonics.shape[1]) - 1
-        if (self.degree + 1) ** 2 != harmonics.shape[1]:
-            raise ValueError(f"Gaussians: no degree has {harmonics.shape[1]} harmonics")
+        self.sh_degree = math.isqrt(harmonics.shape[1]) - 1
+        if (self.sh_degree + 1) ** 2 != harmonics.shape[1]:
+            raise ValueError(f"Gaussians: no SH degree has {harmonics.shape[1]} harmonics")
         self.means = nn.Parameter(means)
         self.quaternions = nn.Parameter(quaternions)
         self.log_scales = nn.Parameter(log_scales)
@@ -64,20 +64,20 @@ class Gaussians(nn.Module):
         colours: Float[Tensor, "n c"],
         sizes: Float[Tensor, "n"],
         *,
-        degree: int = 0,
+        sh_degree: int = 0,
         opacity: float = 0.1,
     ) -> "Gaussians":
-        """Round Gaussians that look the same from everywhere.
+        """Spheres of the same colour in all directions.
 
         Args:
-            points: Where they are.
+            points: Their means.
             colours: Not below zero.
             sizes: Standard deviations in world units.
-            degree: Of the harmonics they can learn, 0 to 3.
+            sh_degree: Of the spherical harmonics they can learn, 0 to 3.
             opacity: Of each, between 0 and 1.
         """
         count, channels = colours.shape
-        harmonics = torch.zeros(count, (degree + 1) ** 2, channels, device=points.device)
+        harmonics = torch.zeros(count, (sh_degree + 1) ** 2, channels, device=points.device)
         harmonics[:, 0] = (colours - GREY) / FLAT
         upright = torch.tensor([1.0, 0.0, 0.0, 0.0], device=points.device)
         logit = math.log(opacity / (1 - opacity))
@@ -105,7 +105,7 @@ class Gaussians(nn.Module):
 
     @property
     def rotations(self) -> Float[Tensor, "n 3 3"]:
-        """From their own axes to the world's."""
+        """World-from-own-axes."""
         return rotation_from_quaternion(self.quaternions)
 
     @property
@@ -114,15 +114,15 @@ class Gaussians(nn.Module):
         return torch.cat([self.base_harmonics, self.higher_harmonics], 1)
 
     def colours(
-        self, seen_from: Float[Tensor, "v 3"], *, degree: int | None = None
+        self, seen_from: Float[Tensor, "v 3"], *, sh_degree: int | None = None
     ) -> Float[Tensor, "v n c"]:
-        """What is sent to some places.
+        """The colour of each Gaussian as seen from v camera centres.
 
         Args:
-            seen_from: Centres of cameras.
-            degree: Leaves out harmonics above it; by default none.
+            seen_from: Camera centres in world axes.
+            sh_degree: Leaves out harmonics above it; by default none.
         """
-        degree = self.degree if degree is None else min(degree, self.degree)
+        degree = self.sh_degree if sh_degree is None else min(sh_degree, self.sh_degree)
         light = (GREY + FLAT * self.base_harmonics[:, 0])[None]  # [1, n, c]
         if degree == 0:
             return light.clamp_min(0).expand(len(seen_from), -1, -1)
@@ -132,11 +132,11 @@ class Gaussians(nn.Module):
         return (light + torch.einsum("vnk,nkc->vnc", basis, learned)).clamp_min(0)
 
     def points(self) -> dict[str, Tensor]:
-        """What has one row for each Gaussian, by the name of its parameter."""
+        """All parameters by name; each has one row for each Gaussian."""
         return dict(self.named_parameters())
 
     def replace(self, points: Mapping[str, Tensor]) -> None:
-        """Become other Gaussians, of any number; all parameters are new objects.
+        """Replace all Gaussians by others, of any number; all parameters are new objects.
 
         Args:
             points: By the names of `points`, with the same rows.

@@ -34,14 +34,14 @@ def merge(models: Sequence[object], blocks: Sequence[Block]) -> SplatModel:
         if abs(other.change.scale / first.change.scale - 1) > 1e-9:
             raise OptionError("the blocks live in different worlds", do="train them on one capture")
     parts = [_own(model, block) for model, block in zip(splats, blocks, strict=True)]
-    first.scene.gaussians.replace(
+    first.scene.static.replace(
         {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
     )
     return first
 
 
 def _own(model: SplatModel, block: Block) -> dict[str, Tensor]:
-    gaussians = model.scene.gaussians
+    gaussians = model.scene.static
     places = model.change.inverse().points(gaussians.means.detach().cpu().double().numpy())
     inside = torch.from_numpy(block.holds(places)).to(gaussians.means.device)
     return {name: tensor.detach()[inside] for name, tensor in gaussians.points().items()}

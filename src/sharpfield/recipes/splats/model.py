@@ -1,18 +1,16 @@
-"""The model of all splat recipes: Gaussians, the looks of each step, and the unknowns.
+"""The model of all recipes on Gaussians, static or moving: sample views, render, compare.
 
-A step looks at whole images, or at a part of one, in one of two ways. *Early*, where events can
-make sharp images, it looks at one instant, drawn from the whole capture, and compares one view
-with the image that events carry there: cheap, and from everywhere. *Late* it looks at one
-exposure: views at several instants of it whose mean is the blurred frame, and one instant beside
-it, with the events counted between each two that follow each other.
+A step renders whole views, or crops of them, in one of two ways. In the *EDI phase*, where events
+give latent frames, it compares one view of each camera with the latent frame at that instant. After
+it, it renders one exposure: views at several instants whose mean is the blurred frame, and one
+instant beside it, with the events counted from each to the next.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.camera import Camera
@@ -23,13 +21,18 @@ from sharpfield.core.points import Growth
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
+from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
 from sharpfield.events.counts import on_frame_clock
-from sharpfield.formation.mixing import mix, mix_of_few
-from sharpfield.geometry.normalise import normalised
+from sharpfield.fields.gaussians.dynamic import MovingGaussians
+from sharpfield.fields.gaussians.static import Gaussians
+from sharpfield.formation.exposure import EventWindow, ExposureOfViews
+from sharpfield.geometry.normalise import centred, normalised
 from sharpfield.geometry.rolling import Rolling
-from sharpfield.losses.event_counts import event_terms
-from sharpfield.losses.photometric import relative_depth_error
+from sharpfield.initialisation.moving import moving_gaussians
+from sharpfield.initialisation.static_points import backdrop_points, static_points
+from sharpfield.losses.event_counts import count_error, threshold_error
+from sharpfield.losses.photometric import relative_depth_error, l1
 from sharpfield.metrics.quality import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (
     LearnedCalibration,
@@ -39,186 +42,193 @@ from sharpfield.recipes.splats.learned_calibration import (
     with_learned_exposure_motion,
     with_learned_poses,
 )
-from sharpfield.recipes.splats.scene import GaussianOptions, SplatScene, cooldown
-from sharpfield.recipes.splats.start import starting_gaussians
+from sharpfield.recipes.splats.scene import GaussianOptions, MotionOptions, SplatScene, cooldown
 from sharpfield.sampling.views import SamplingOptions, ViewSampler
+from sharpfield.storage.event_cache import event_index
 
 Terms = dict[str, Tensor]
 
 
-@runtime_checkable
-class SplatNumbers(Protocol):
-    """The numbers of a splat recipe."""
-
-    @property
-    def steps(self) -> int:
-        """Length of the schedule."""
-        ...
-
-    @property
-    def gaussians(self) -> GaussianOptions:
-        """What the scene is made of."""
-        ...
-
-    @property
-    def looks(self) -> SamplingOptions:
-        """What steps look at."""
-        ...
-
-    @property
-    def unknowns(self) -> LearnedCalibrationOptions:
-        """What else is learned."""
-        ...
-
-
 class SplatModel(nn.Module):
-    """A splat recipe on one capture. Frames, events, or both: what is missing is left out.
+    """Gaussians on one capture. Frames, events, or both: what is missing is left out.
 
     Args:
-        recipe: With `gaussians`, `looks`, `unknowns` and `steps`.
         capture: As read.
         seed: Of the run.
+        steps: Length of the schedule.
+        gaussians: The static Gaussians, and how Gaussians grow.
+        sampling: Which views a step renders, and the weights of losses.
+        calibration: Which parts of the calibration are learned.
+        motion: The moving Gaussians; None for a static scene.
     """
 
-    def __init__(self, recipe: SplatNumbers, capture: Capture, seed: int) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        seed: int,
+        *,
+        steps: int,
+        gaussians: GaussianOptions,
+        sampling: SamplingOptions,
+        calibration: LearnedCalibrationOptions,
+        motion: MotionOptions | None = None,
+    ) -> None:
         super().__init__()
-        self.recipe, self.seed = recipe, seed
-        self.options = recipe.looks
-        self.capture, self.change = normalised(capture)
-        if _motion_unknown(capture) and self.options.blur == "motion":
+        self.steps, self.seed, self.sampling = steps, seed, sampling
+        # A hull of what moves needs a box around the scene; a static one keeps its near depth.
+        self.capture, self.change = normalised(capture) if motion is None else centred(capture)
+        if _motion_unknown(capture) and sampling.blur == "motion":
             self.capture = with_learned_exposure_motion(self.capture, seed)
         else:
-            self.capture = with_learned_poses(self.capture, recipe.unknowns)
+            self.capture = with_learned_poses(self.capture, calibration)
         self.path, self.shutter = self.capture.trajectory, Rolling.of(self.capture)
         aligned = align_events_to_rolling_shutter(self.capture)
         self.encoding = capture.frames.encoding if capture.frames else "gamma2.2"
         self.tone = tone_of(self.encoding)
-        self.unknowns = LearnedCalibration(recipe.unknowns, self.capture, seed)
+        self.calibration = LearnedCalibration(calibration, self.capture, seed)
         weights = None
-        if self.options.quality != "even" and aligned.frames is not None:
-            weights = frame_weights(aligned, self.options.quality)[aligned.split.train]
-        self.looks = ViewSampler(self.options, aligned, seed, weights)
+        if sampling.frame_quality != "even" and aligned.frames is not None:
+            weights = frame_weights(aligned, sampling.frame_quality)[aligned.split.train]
+        self.sampler = ViewSampler(
+            sampling,
+            aligned,
+            seed,
+            steps=steps,
+            weights=weights,
+            separate_events=self.calibration.offset_steps is not None,
+        )
         self.scene = SplatScene(
-            recipe.gaussians,
+            gaussians,
             self.capture,
-            starting_gaussians(
-                recipe.gaussians,
-                aligned,
-                self.unknowns.guess,
-                self.tone,
-                seed,
-                weights=self.looks.weights,
-            ),
+            self._static_start(gaussians, aligned, moves=motion is not None),
+            None if motion is None else (self._moving_start(gaussians, motion, aligned), motion),
             self.tone,
-            steps=recipe.steps,
+            steps=steps,
             seed=seed,
         )
-        early = self.options.early if self.looks.sharp is not None else 0.0
-        self.late_from = int(early * recipe.steps)
-        self.still_until = int(self.options.still * recipe.steps)
-        settles = max(self.late_from, self.scene.last_growth)
-        left = 1.0 if capture.frames is None else self.options.fading
-        self.guidance = cooldown(settles, recipe.steps, left=left)
+        settled = max(self.sampler.edi_until, self.scene.last_growth)
+        sharp = capture.frames is None or self.sampler.pairs
+        left = 1.0 if sharp else sampling.final_event_weight
+        self.event_decay = cooldown(settled, steps, left=left)
+        self.events_weight = sampling.events_weight(capture)
+        self.poses_lr = falling(calibration.poses_lr, max(steps, 1))
+
+    def _static_start(
+        self, options: GaussianOptions, capture: Capture, *, moves: bool
+    ) -> Gaussians:
+        made = generator(self.seed, 0, "start")
+        count = max(int(options.start * options.count(capture)), 1)
+        if moves:
+            start = backdrop_points(capture, count, made, size=options.scale)
+        else:
+            start = static_points(
+                capture,
+                self.tone,
+                self.calibration.first_thresholds,
+                count,
+                made,
+                weights=self.sampler.weights,
+                size=options.scale,
+            )
+        return Gaussians.start(
+            torch.from_numpy(start.points),
+            self.tone.encode(torch.from_numpy(start.colours)),
+            torch.from_numpy(start.sizes),
+            sh_degree=options.sh_degree,
+            opacity=options.opacity,
+        )
+
+    def _moving_start(
+        self, options: GaussianOptions, motion: MotionOptions, capture: Capture
+    ) -> MovingGaussians:
+        count = max(int(options.start * motion.count(options, capture)), 1)
+        events = capture.events
+        return moving_gaussians(
+            capture,
+            None if events is None or events.rectified else event_index(events),
+            self.tone,
+            count,
+            self.seed,
+            lifespan=motion.lifespan(capture),
+            opacity=options.opacity,
+        )
 
     @property
     def heaviest_step(self) -> int:
-        """The first step that looks at several views."""
-        several = max(self.late_from, self.still_until)
-        return min(several, max(self.recipe.steps - 1, 0))
+        """The first step that renders several views."""
+        several = max(self.sampler.edi_until, self.sampler.sharp_until)
+        return min(several, max(self.steps - 1, 0))
+
+    @property
+    def exposure(self) -> ExposureOfViews:
+        """What frames are of views."""
+        return ExposureOfViews(self.shutter, self.tone.encode, self.calibration.log_gain)
+
+    @property
+    def window(self) -> EventWindow:
+        """What counted events are of views."""
+        return EventWindow(self.shutter, self.calibration.response)
 
     def draw(self, step: int) -> Batch:
-        """One instant in early steps; in late ones an exposure, or a stretch of events."""
-        sensor_estimate = self.unknowns.sensor_estimate()
-        if step < self.late_from:
-            batch = self.looks.instant(step, sensor_estimate)
-        elif self.capture.frames is None:
-            batch = self.looks.stretch(step)
-        elif self.unknowns.offset_steps is None or self.looks.motion is None:
-            still = step < self.still_until
-            batch = self.looks.exposure(
-                step, events=not still, sensor_estimate=sensor_estimate, still=still
-            )
-        # Views of the frames' instants cannot tell when events really happened.
-        elif step % 2:
-            batch = self.looks.stretch(step)
-        else:
-            batch = self.looks.exposure(step, events=False, sensor_estimate=sensor_estimate)
-        device = self.scene.gaussians.means.device
+        """What a step renders, and what was measured of it, see `ViewSampler.draw`."""
+        batch = self.sampler.draw(step, self.calibration.sensor_estimate())
+        device = self.scene.static.means.device
         return {name: seen.to(device) for name, seen in batch.items()}
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Errors of sharp images, of the blurred one, and of the events between instants."""
-        assert isinstance(look := batch["look"], Instants)
-        frames, sharp, events = (batch.get(name) for name in ("frames", "sharp", "events"))
-        only_events = events is not None and frames is None
-        light = self._drawn(look, self.unknowns.on_time(look.time) if only_events else look.time)
-        terms, guidance = self.scene.opacity_scale_penalty(step), self.guidance(step)
-        if isinstance(frames, Pixels):
-            blurred = self._exposed(self._mean(light, batch.get("rest")), frames.frame[:, 0, 0])
-            terms["blur"] = (self.tone.encode(blurred) - frames.value).abs().mean()
-        if isinstance(sharp, Pixels):
-            weight = 1.0 if step < self.late_from else guidance * self.options.sharp
-            stored = self.tone.encode(self._exposed(light.rgb, sharp.frame[:, 0, 0, 0]))
-            terms["sharp"] = weight * (stored - sharp.value).abs().mean()
+        """Errors of latent frames, of the blurred frame, and of the events between instants."""
+        assert isinstance(seen := batch["views"], Instants)
+        views, exposure = self._views(seen, batch), self.exposure
+        light = self.scene.draw(views, step=step)  # [m, h, w, k]
+        terms, decay = self.scene.penalties(step), self.event_decay(step)
+        if isinstance(frames := batch.get("frames"), Pixels):
+            blurred = exposure.observe(light, frames, self._no_grad(batch, step))
+            terms["blur"] = l1(blurred, frames.value)
+        if isinstance(latent := batch.get("latent_frames"), Pixels):
+            weight = decay * self.sampling.latent_weight if "frames" in batch else 1.0
+            terms["latent"] = weight * l1(exposure.observe_each(light, latent), latent.value)
         if isinstance(depth := batch.get("depth"), Depths):
-            drawn = light.depth.gather(-1, depth.instant[..., None])[..., 0]
-            terms["depth"] = self.options.depth * relative_depth_error(drawn, depth.value)
-        if isinstance(events, EventPairs):
-            terms |= event_terms(
-                light,
-                events,
-                response=self.unknowns.response,
-                thresholds=self.unknowns.thresholds,
-                learn_thresholds=self.unknowns.learns_thresholds,
-                weight=guidance * self.options.windows,
-            )
-        if (prior := self.unknowns.prior()) is not None:
+            rendered = light.depth.gather(-1, depth.instant[..., None])[..., 0]  # [m, h, w]
+            terms["depth"] = self.sampling.depth_weight * relative_depth_error(rendered, depth.value)
+        if isinstance(events := batch.get("events"), EventPairs):
+            change, thresholds = self.window.observe(light, events), self.calibration.thresholds
+            weight = decay * self.events_weight
+            terms["events"] = weight * count_error(change, events, thresholds)
+            if self.calibration.learns_thresholds:
+                terms["thresholds"] = weight * threshold_error(change, events, thresholds)
+        if (prior := self.calibration.prior()) is not None:
             terms["prior"] = prior
         return terms
 
-    def _drawn(self, look: Instants, time: Float[Tensor, "m k"]) -> Radiance:
-        """The views of some looks, as if they were taken at a time."""
-        return self.scene.draw(
-            Views(
-                *(self.shutter.pose(time, look.track), time, look.weight, look.corner, look.size),
-                rows=self.shutter.rows(time, look.track),
-            )
-        )
+    def _views(self, seen: Instants, batch: Batch) -> Views:
+        """By the clock of the frames, or by that of the events where there are only these."""
+        if batch.keys() == {"views", "events"}:
+            return self.window.expose(seen, self.calibration.corrected_time(seen.time))
+        return self.exposure.expose(seen)
 
-    def _mean(self, light: Radiance, rest: object) -> Float[Tensor, "m h w c"]:
-        """The mean light over an exposure, with the gradient of the mean of a few of its views.
-
-        A mean of few views is not that over the exposure: if it had to equal the blurred frame
-        whatever the instants, a scene that is itself a little blurred would do best.
-        """
-        if not isinstance(rest, Instants):
-            return mix(light)
+    def _no_grad(self, batch: Batch, step: int) -> Radiance | None:
+        """The light of the views of an exposure that the scene does not learn through."""
+        if not isinstance(seen := batch.get("no_grad_views"), Instants):
+            return None
         with torch.no_grad():
-            others = self._drawn(rest, rest.time)
-        return mix_of_few(light, others)
-
-    def _exposed(self, light: Float[Tensor, "m *b c"], frame: Int64[Tensor, "m"]) -> Tensor:
-        """Light as bright as each frame was exposed."""
-        if self.unknowns.log_gain is None:
-            return light
-        return light * self.unknowns.log_gain[frame].exp().reshape(-1, *[1] * (light.ndim - 1))
+            return self.scene.draw(self.exposure.expose(seen), step=step)
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
         return self.scene.draw(views)
 
-    def through(self, camera: Camera) -> "OtherLens":
+    def through(self, camera: Camera) -> "WithCamera":
         """The same scene, seen by another camera than the capture's."""
         return WithCamera(self.scene, camera)
 
     def render(self, rays: Rays) -> Radiance:
-        """Not possible: Gaussians are drawn as whole views.
+        """Not possible: Gaussians are rendered as whole views.
 
         Raises:
             OptionError: Always.
         """
         raise OptionError(
-            "a scene of Gaussians draws whole views, not scattered rays",
+            "a scene of Gaussians renders whole views, not scattered rays",
             got=f"{rays.weight.numel()} rays",
             do="call draw_views",
         )
@@ -227,17 +237,20 @@ class SplatModel(nn.Module):
         """As the frames store it."""
         return self.tone.encode(light).clamp(0, 1)
 
+    def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
+        """As the event camera sees it: natural log of the luma, through the learned response."""
+        return self.calibration.log_light(light)
+
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
         """What becomes of the Gaussians after a step."""
         return self.scene.grow(step)
 
     def groups(self) -> list[Group]:
-        """Gaussians, unknowns and poses."""
-        steps = max(self.recipe.steps, 1)
+        """Gaussians, calibration and poses."""
         return [
             *self.scene.groups(),
-            *self.unknowns.groups(steps),
-            *pose_groups(self.capture, falling(self.recipe.unknowns.poses_rate, steps)),
+            *self.calibration.groups(max(self.steps, 1)),
+            *pose_groups(self.capture, self.poses_lr),
         ]
 
 
@@ -250,11 +263,11 @@ class WithCamera:
 
     def draw_views(self, views: Views) -> Radiance:
         """Sharp linear light of whole views."""
-        return replace(self.scene.splatting, camera=self.camera)(self.scene.gaussians, views)
+        return self.scene.draw(views, self.camera)
 
 
 def align_events_to_rolling_shutter(capture: Capture) -> Capture:
-    """The capture with the events that are learned from on the clock of its rolling shutter."""
+    """The capture with its training events on the clock of the first row of its rolling shutter."""
     frames, events = capture.frames, capture.events
     if frames is None or events is None:
         return capture

@@ -16,7 +16,7 @@ from sharpfield.core.seed import generator
 from sharpfield.events.index import EventIndex
 from sharpfield.fields.voxels import VoxelField, VoxelSizes, moving_shapes, static_shapes
 from sharpfield.geometry.normalise import centred
-from sharpfield.initialisation.visual_hull import hull
+from sharpfield.initialisation.visual_hull import visual_hull
 from sharpfield.ops.voxel_march import DENSITY_SHIFT
 from sharpfield.rendering.voxels import BoxSteps
 
@@ -67,7 +67,7 @@ class MovingScene(nn.Module):
         self.path = self.capture.trajectory
         hulls, shapes = None, moving_shapes(options.size)
         if options.hull and index is not None:
-            hulls = [hull(self.capture, index, cells, moments) for moments, cells in shapes]
+            hulls = [visual_hull(self.capture, index, cells, moments) for moments, cells in shapes]
         occupied = [one.possible for one in hulls or [] if one is not None]
         self.field = VoxelField(
             static_shapes(options.size),
