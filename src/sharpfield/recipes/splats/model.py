@@ -189,7 +189,9 @@ class SplatModel(nn.Module):
             terms["latent"] = weight * l1(exposure.observe_each(light, latent), latent.value)
         if isinstance(depth := batch.get("depth"), Depths):
             rendered = light.depth.gather(-1, depth.instant[..., None])[..., 0]  # [m, h, w]
-            terms["depth"] = self.sampling.depth_weight * relative_depth_error(rendered, depth.value)
+            terms["depth"] = self.sampling.depth_weight * relative_depth_error(
+                rendered, depth.value
+            )
         if isinstance(events := batch.get("events"), EventPairs):
             change, thresholds = self.window.observe(light, events), self.calibration.thresholds
             weight = decay * self.events_weight
