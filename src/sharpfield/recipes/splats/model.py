@@ -32,7 +32,7 @@ from sharpfield.geometry.rolling import Rolling
 from sharpfield.initialisation.moving import moving_gaussians
 from sharpfield.initialisation.static_points import backdrop_points, static_points
 from sharpfield.losses.event_counts import count_error, threshold_error
-from sharpfield.losses.photometric import relative_depth_error, l1
+from sharpfield.losses.photometric import l1, relative_depth_error
 from sharpfield.metrics.quality import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (
     LearnedCalibration,
