@@ -18,7 +18,8 @@ from sharpfield.preparation.deblurring import deblur as deblur_capture
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.settings.options import with_options
 from sharpfield.recipes.settings.presets import prepared
-from sharpfield.recordings.open import open_recording
+from sharpfield.recordings.open import open_recording as open_any
+from sharpfield.recordings.recording import ReaderOptions, Recording
 from sharpfield.runs.captures import LayoutName, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
@@ -85,6 +86,59 @@ def read(
         trust_pickle=trust_pickle,
     )
     return read_capture(path, options, poses=poses)
+
+
+def open_recording(
+    path: Path | str,
+    *,
+    layout: str | None = None,
+    unit: str | None = None,
+    size: tuple[int, int] | None = None,
+    topic: str | None = None,
+    image_topic: str | None = None,
+    columns: str | None = None,
+    event_encoding: str | None = None,
+    frame_unit: str | None = None,
+    fps: float | int | None = None,
+    times: Path | str | None = None,
+) -> Recording:
+    """Open what a camera or a program has written; events and frames are read when asked for.
+
+    Options say what the file does not, or where it is wrong.
+
+    Args:
+        path: A file or a folder.
+        layout: Name of the format, such as evt, aedat4, rosbag or hdf5; by default it is
+            recognised.
+        unit: Of the event times: ns, us, ms or s.
+        size: Resolution of the event sensor in px, width and height.
+        topic: Which of several cameras, streams or topics to take the events from.
+        image_topic: Which of several to take the images from; an empty text for none.
+        columns: Order of the columns in a table of events: xytp or txyp.
+        event_encoding: Of a Prophesee RAW file: evt2, evt2.1, evt2.1-legacy or evt3.
+        frame_unit: Unit of the image times: ns, us, ms or s.
+        fps: Frames recorded per second, where no file gives their times, or a video is slow motion.
+        times: The file with the image times, where there are several candidates.
+
+    Returns:
+        What is known of the sensor; `load()` or `chunks()` for its events, `frames()` for images.
+
+    Raises:
+        CaptureError: The file is missing, of no known format, damaged, or leaves something open.
+        OptionError: An option does not belong to the format.
+    """
+    options = ReaderOptions(
+        unit,
+        size,
+        topic,
+        image_topic,
+        columns,
+        event_encoding,
+        frame_unit,
+        None if fps is None else float(fps),
+        None if times is None else Path(times),
+    )
+    return open_any(path, options, layout=layout)
 
 
 def simulate(

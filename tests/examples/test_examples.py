@@ -1,6 +1,7 @@
 """The examples run as a reader would run them, only smaller."""
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -20,10 +21,13 @@ RUNS = {
 """What each is run with, and what it says at the end."""
 
 TEN_LINES = ROOT / "examples" / "00_ten_lines.py"
-SMALLER = {"size=(120, 80), frames=18": "size=(24, 16), frames=4", "minutes=1": "steps=5"}
-"""How the first example is cut down, as it takes no options."""
+NOTEBOOK = ROOT / "examples" / "from_capture_to_image.ipynb"
+SMALLER = {"size=(120, 80), frames=18": "size=(24, 16), frames=5", "minutes=": "steps="}
+"""How those examples are cut down that take no options."""
 
 LINES = 60
+
+SETTINGS = {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
 
 
 @pytest.mark.parametrize("name", RUNS)
@@ -38,16 +42,23 @@ def test_runs(name: str, tmp_path: Path) -> None:
 
 
 def test_ten_lines_do_everything(tmp_path: Path) -> None:
-    text = TEN_LINES.read_text()
-    for long, short in SMALLER.items():
-        assert long in text
-        text = text.replace(long, short)
+    text = smaller(TEN_LINES.read_text())
     done = python(["-c", text], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "held-out views" in done.stdout and (tmp_path / "ten_lines.ply").exists()
     assert (tmp_path / "runs" / "ten_lines" / "report.html").exists()
     imports = [line for line in text.splitlines() if line.startswith(("import", "from"))]
     assert imports == ["import sharpfield as sf"] and code_lines(TEN_LINES) <= 10
+
+
+def test_the_notebook_runs_from_top_to_bottom(tmp_path: Path) -> None:
+    book = json.loads(NOTEBOOK.read_text())
+    assert (book["nbformat"], book["nbformat_minor"]) == (4, 5)
+    code = ["".join(one["source"]) for one in book["cells"] if one["cell_type"] == "code"]
+    assert all(not one.get("outputs") for one in book["cells"])
+    done = python(["-c", smaller("\n\n".join(code))], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("EventStream(") == 2 and (tmp_path / "notebook.ply").exists()
 
 
 def test_numbered_examples_are_all_run_and_short() -> None:
@@ -57,12 +68,21 @@ def test_numbered_examples_are_all_run_and_short() -> None:
         assert code_lines(path) < LINES, path.name
 
 
+def smaller(text: str) -> str:
+    """An example at a size that takes seconds."""
+    for long, short in SMALLER.items():
+        assert long in text
+        text = text.replace(long, short)
+    return text
+
+
 def python(words: list[str | Path], folder: Path) -> subprocess.CompletedProcess[str]:
     """What the interpreter says, run in a folder."""
     return subprocess.run(
         [sys.executable, *words],
         cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1"},
+        env=os.environ
+        | {"PYTHONPATH": str(ROOT / "src"), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,
     )

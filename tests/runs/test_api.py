@@ -223,3 +223,14 @@ def test_a_run_gives_its_gaussians_and_a_video_away(run: sf.Run, tmp_path: Path)
     assert len(list((tmp_path / "images").glob("*.png"))) == 2
     with pytest.raises(sf.SharpfieldError, match="exported as .ply"):
         run.export(tmp_path / "scene.obj")
+
+
+def test_recordings_are_opened_with_what_their_files_do_not_say(tmp_path: Path) -> None:
+    file = tmp_path / "events.txt"
+    file.write_text("1000 3 2 1\n2000 4 1 0\n")
+    recording = sf.open_recording(file, unit="ns", size=(6, 5), columns="txyp")
+    events = recording.load()
+    assert (events.width, events.height, len(events)) == (6, 5, 2)
+    assert events.t_us.tolist() == [1, 2] and events.p.tolist() == [1, -1]
+    with pytest.raises(sf.SharpfieldError, match="no option topic"):
+        sf.open_recording(file, topic="/events")
