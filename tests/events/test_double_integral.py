@@ -12,7 +12,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
 from sharpfield.events import double_integral as edi
-from sharpfield.events.log_path import LogPath, direct, follow
+from sharpfield.events.log_path import LogPath, exposure_path, pixel_spread
 from sharpfield.events.threshold import FixedThresholds
 
 GOLDEN_SLICES = [0.2, 0, -0.2, 0.2, 0.2, 0, 0.2, -0.2]
@@ -97,8 +97,10 @@ def test_slices_integrate_a_broken_line_exactly(rise: float) -> None:
 
 def test_latents_at_several_instants_follow_the_events() -> None:
     events = events_of([200, 600], [1, -1])
-    spread = direct(width=3, height=1)
-    path = follow(events, (0, 800), np.array([100, 400, 700]), FixedThresholds(0.3, 0.2), spread)
+    spread = pixel_spread(width=3, height=1)
+    path = exposure_path(
+        events, (0, 800), np.array([100, 400, 700]), FixedThresholds(0.3, 0.2), spread
+    )
     sharp = torch.stack([edi.latent(torch.ones(1, 3, 1), path, k)[0, 0, 0] for k in range(3)])
     torch.testing.assert_close(sharp.log().diff(), torch.tensor([0.2, -0.3]))
 

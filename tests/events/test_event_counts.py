@@ -8,7 +8,7 @@ import torch
 
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.events.counts import counts_between
-from sharpfield.events.log_path import change_between, covered, direct
+from sharpfield.events.log_path import change_between, pixel_spread, site_spread
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 
@@ -26,20 +26,20 @@ def stream(n: int = 400) -> EventStream:
 
 
 def mono() -> EventMotion:
-    return EventMotion(stream(), direct(width=WIDTH, height=HEIGHT), None)
+    return EventMotion(stream(), pixel_spread(width=WIDTH, height=HEIGHT), None)
 
 
 def rectified() -> EventMotion:
     events = stream()
     x, y = events.x + np.float32(0.25), events.y - np.float32(0.5)
-    return EventMotion(replace(events, x=x, y=y), direct(width=WIDTH, height=HEIGHT), None)
+    return EventMotion(replace(events, x=x, y=y), pixel_spread(width=WIDTH, height=HEIGHT), None)
 
 
 def bayer() -> EventMotion:
     events = replace(stream(), bayer="RGGB")
     y, x = np.divmod(np.arange(WIDTH * HEIGHT), WIDTH)
     sites = np.stack([x, y], -1).astype(np.float32)
-    spread = covered(sites, RGGB[2 * (y % 2) + x % 2], width=WIDTH, height=HEIGHT)
+    spread = site_spread(sites, RGGB[2 * (y % 2) + x % 2], width=WIDTH, height=HEIGHT)
     return EventMotion(events, spread, RGGB[2 * (events.y % 2) + events.x % 2])
 
 
@@ -94,7 +94,9 @@ def test_rectified_colours_count_at_their_sites() -> None:
     events = EventStream(
         x, y, np.array([1, 2, 3]), np.array([1, 1, -1], np.int8), WIDTH, HEIGHT, site_colour=sites
     )
-    spread = covered(np.stack([sites.x, sites.y], -1), sites.channel, width=WIDTH, height=HEIGHT)
+    spread = site_spread(
+        np.stack([sites.x, sites.y], -1), sites.channel, width=WIDTH, height=HEIGHT
+    )
     motion = EventMotion(events, spread, np.array([2, 2, 0], np.int8))
     negative, positive = counts_between(motion, 0, 9)
     assert positive[2, 4].tolist() == pytest.approx([0, 0, 2])

@@ -6,7 +6,7 @@ import torch
 
 from sharpfield.core.events import EventStream
 from sharpfield.events.counts import counts_between
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import FALL_US, LONGEST_US, OVERSHOOT, phase_at
 from sharpfield.simulation.cameras.motions import motion
@@ -29,7 +29,7 @@ def stream(*events: tuple[int, int, int]) -> EventStream:
 
 @pytest.mark.parametrize("polarity", [-1, 1])
 def test_half_way_in_time_is_half_an_event(polarity: int) -> None:
-    index = build(stream((1, 1000, polarity), (1, 5000, polarity)))
+    index = build_index(stream((1, 1000, polarity), (1, 5000, polarity)))
     for time_us, share in ((1000, 0.0), (2000, 0.25), (3000, 0.5), (4999, 0.99975)):
         phase, known = phase_at(index, time_us, **SIZE)
         assert known.tolist() == [[False, True, False]]
@@ -50,14 +50,14 @@ def test_half_way_in_time_is_half_an_event(polarity: int) -> None:
 def test_elsewhere_it_is_unknown_but_likely(
     events: list[tuple[int, int, int]], likely: float
 ) -> None:
-    phase, known = phase_at(build(stream(*events)), 2000, **SIZE)
+    phase, known = phase_at(build_index(stream(*events)), 2000, **SIZE)
     assert not known.any()
     torch.testing.assert_close(phase, torch.tensor([[likely, 0.0, 0.0]]).float())
 
 
 def test_light_that_turned_falls_to_the_next_event_at_last() -> None:
     """Without a jump, within `FALL_US` before it, and by then all the way."""
-    index = build(stream((1, 1000, 1), (1, 31_000, -1)))
+    index = build_index(stream((1, 1000, 1), (1, 31_000, -1)))
     phase = [float(phase_at(index, 31_000 - ahead, **SIZE)[0][0, 1]) for ahead in range(6000)]
     assert phase[FALL_US:] == [pytest.approx(OVERSHOOT)] * (6000 - FALL_US)
     assert phase[1] == pytest.approx(-1, abs=1e-3)
@@ -72,13 +72,15 @@ def test_a_thrown_stone_is_a_third_of_a_threshold_up_on_average() -> None:
 
 
 def test_events_at_one_time_are_no_trouble() -> None:
-    phase, _ = phase_at(build(stream((0, 1000, 1), (0, 2000, 1), (0, 2000, -1))), 2000, **SIZE)
+    phase, _ = phase_at(
+        build_index(stream((0, 1000, 1), (0, 2000, 1), (0, 2000, -1))), 2000, **SIZE
+    )
     assert phase[0, 0] == pytest.approx(-OVERSHOOT)
 
 
 def test_at_an_event_whole_counts_meet() -> None:
     """Just before an event the phase is nearly one; just after it the count is one higher."""
-    index = build(stream((0, 1000, 1), (0, 5000, 1), (0, 9000, 1)))
+    index = build_index(stream((0, 1000, 1), (0, 5000, 1), (0, 9000, 1)))
     before, after = (float(phase_at(index, t, **SIZE)[0][0, 0]) for t in (4999, 5000))
     assert before == pytest.approx(1, abs=1e-3) and after == 0
 

@@ -37,7 +37,7 @@ def events(request: pytest.FixtureRequest) -> EventStream:
 
 
 def test_index_holds_each_sites_events_in_order_of_time(events: EventStream) -> None:
-    index = ops.build(events)
+    index = ops.build_index(events)
     assert len(index) == len(events) and index.offset[-1] == len(events)
     for site, xy in enumerate(index.site_xy):
         here = of_site(events, xy)
@@ -47,7 +47,7 @@ def test_index_holds_each_sites_events_in_order_of_time(events: EventStream) -> 
 
 
 def test_pixels_are_sites_row_by_row() -> None:
-    index = ops.build(stream(3))
+    index = ops.build_index(stream(3))
     assert index.sites == WIDTH * HEIGHT
     np.testing.assert_array_equal(index.site_xy[2 * WIDTH + 3], [3, 2])
 
@@ -55,7 +55,7 @@ def test_pixels_are_sites_row_by_row() -> None:
 def test_rectified_sites_are_the_distinct_positions() -> None:
     events = stream(rectified=True)
     expected = np.unique(np.stack([events.y, events.x], -1), axis=0)[:, ::-1]
-    np.testing.assert_array_equal(ops.build(events).site_xy, expected)
+    np.testing.assert_array_equal(ops.build_index(events).site_xy, expected)
 
 
 def test_many_rectified_sites_outgrow_the_first_table() -> None:
@@ -63,7 +63,7 @@ def test_many_rectified_sites_outgrow_the_first_table() -> None:
     x, y = rng.random((2, 100_000), dtype=np.float32) * 5
     n = len(x)
     events = EventStream(x, y, np.arange(n), np.ones(n, np.int8), WIDTH, HEIGHT)
-    index = ops.build(events)
+    index = ops.build_index(events)
     back = ops.sites_at(index, np.stack([x, y], -1))
     assert index.sites == n
     np.testing.assert_array_equal(index.t_us[index.offset[back]], events.t_us)
@@ -72,17 +72,17 @@ def test_many_rectified_sites_outgrow_the_first_table() -> None:
 def test_minus_zero_and_zero_are_one_place() -> None:
     x = np.array([0.0, -0.0], np.float32)
     events = EventStream(x, x, np.array([1, 2]), np.ones(2, np.int8), WIDTH, HEIGHT)
-    assert ops.build(events).sites == 1
+    assert ops.build_index(events).sites == 1
 
 
 def test_sites_at_finds_exact_positions_only(events: EventStream) -> None:
-    index = ops.build(events)
+    index = ops.build_index(events)
     np.testing.assert_array_equal(ops.sites_at(index, index.site_xy), np.arange(index.sites))
     assert ops.sites_at(index, index.site_xy + np.float32(0.01)).max() == -1
 
 
 def test_queries_match_a_slow_loop(events: EventStream) -> None:
-    index = ops.build(events)
+    index = ops.build_index(events)
     rng = np.random.default_rng(1)
     site = rng.integers(0, index.sites, 300)
     start, end = np.sort(rng.integers(-20, 520, (2, 300)), axis=0)
@@ -104,7 +104,7 @@ def test_queries_match_a_slow_loop(events: EventStream) -> None:
 
 
 def test_windows_add_up(events: EventStream) -> None:
-    index = ops.build(events)
+    index = ops.build_index(events)
     site = np.arange(index.sites)
     whole, left, right = (
         ops.signed_sum(index, site, np.full_like(site, a), np.full_like(site, b))
@@ -115,7 +115,7 @@ def test_windows_add_up(events: EventStream) -> None:
 
 @pytest.mark.parametrize("hops", [1, 3])
 def test_chains_start_at_every_event_with_enough_successors(hops: int) -> None:
-    index = ops.build(stream(80))
+    index = ops.build_index(stream(80))
     chain = ops.chains(index, hops)
     rank = np.arange(chain[-1])
     site, position = ops.chain_start(index, chain, rank)
@@ -130,7 +130,7 @@ def test_chains_start_at_every_event_with_enough_successors(hops: int) -> None:
 
 def test_window_image_counts_both_signs() -> None:
     events = stream()
-    image = window_image(ops.build(events), 100, 300, width=WIDTH, height=HEIGHT)
+    image = window_image(ops.build_index(events), 100, 300, width=WIDTH, height=HEIGHT)
     expected = np.zeros((HEIGHT, WIDTH, 2))
     for x, y, t, p in zip(events.x, events.y, events.t_us, events.p, strict=True):
         expected[y, x, int(p > 0)] += 100 <= t < 300
@@ -168,7 +168,7 @@ def test_nearest_splat_rounds_halves_up() -> None:
 def test_empty_stream() -> None:
     for rectified in (False, True):
         none = stream(1, rectified=rectified)[:0]
-        index = ops.build(none)
+        index = ops.build_index(none)
         assert len(index) == 0 and ops.chains(index)[-1] == 0
         assert window_image(index, 0, 9, width=WIDTH, height=HEIGHT).sum() == 0
 
@@ -179,7 +179,7 @@ def test_event_outside_the_sensor_is_refused() -> None:
         np.ones(2, np.int8), WIDTH, HEIGHT,
     )  # fmt: skip
     with pytest.raises(CaptureError, match=re.escape("x 7, y 1, sensor 7x5")):
-        ops.build(events)
+        ops.build_index(events)
 
 
 def test_time_going_back_at_a_pixel_is_refused() -> None:
@@ -188,7 +188,7 @@ def test_time_going_back_at_a_pixel_is_refused() -> None:
         np.ones(2, np.int8), WIDTH, HEIGHT,
     )  # fmt: skip
     with pytest.raises(CaptureError, match="pixel x 2, y 1\n.*an event at 5 us after a later one"):
-        ops.build(events)
+        ops.build_index(events)
 
 
 # Several cameras
@@ -201,11 +201,11 @@ def rig(n: int = 900) -> EventStream:
 
 def test_each_camera_of_a_rig_has_the_index_of_its_own_stream() -> None:
     events = rig()
-    for index in (ops.build(events),):
+    for index in (ops.build_index(events),):
         assert index.sites == 3 * HEIGHT * WIDTH
         for track in range(3):
             own = replace(events.of_track(track), track=None, tracks=1)
-            alone, sites = ops.build(own), index.sites_of(track)
+            alone, sites = ops.build_index(own), index.sites_of(track)
             np.testing.assert_array_equal(index.track_of(sites), track)
             np.testing.assert_array_equal(index.site_xy[sites], alone.site_xy)
             begin, end = index.offset[sites[0]], index.offset[sites[-1] + 1]
@@ -219,7 +219,7 @@ def test_each_camera_of_a_rig_has_the_index_of_its_own_stream() -> None:
 
 
 def test_sites_are_numbered_by_track_row_and_column() -> None:
-    index = ops.build(rig())
+    index = ops.build_index(rig())
     xy = np.array([[3, 2], [6, 4]], np.float32)
     expected = 2 * HEIGHT * WIDTH + np.array([2 * WIDTH + 3, 4 * WIDTH + 6])
     np.testing.assert_array_equal(ops.sites_at(index, xy, track=2), expected)
@@ -229,4 +229,4 @@ def test_sites_are_numbered_by_track_row_and_column() -> None:
 def test_rectified_rigs_are_refused() -> None:
     events = stream(9, rectified=True)
     with pytest.raises(CaptureError, match="must name pixels"):
-        ops.build(replace(events, track=np.zeros(9, np.uint16), tracks=2))
+        ops.build_index(replace(events, track=np.zeros(9, np.uint16), tracks=2))

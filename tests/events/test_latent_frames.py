@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
-from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
+from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
 from sharpfield.events.motion import EventMotion
 from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene
@@ -30,11 +30,11 @@ def recorded() -> Capture:
     return simulate("tiles", rig=Rig((24, 16), event_sensor=SENSOR), timing=TIMING, seed=SEED)
 
 
-def instants(capture: Capture) -> SharpInstants:
-    return SharpInstants(capture, EventMotion.of(capture))
+def instants(capture: Capture) -> LatentFrames:
+    return LatentFrames(capture, EventMotion.of(capture))
 
 
-def at(made: SharpInstants, t_us: int, late_us: int = 0) -> Tensor:
+def at(made: LatentFrames, t_us: int, late_us: int = 0) -> Tensor:
     return made.at(t_us, SensorEstimate(THRESHOLD, THRESHOLD, late_us))
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sharpfield.core.events import EventStream
-from sharpfield.events.log_path import change_between, covered, direct, follow
+from sharpfield.events.log_path import change_between, exposure_path, pixel_spread, site_spread
 from sharpfield.events.threshold import FixedThresholds
 
 WIDTH, HEIGHT = 6, 5
@@ -38,8 +38,12 @@ def grid() -> tuple[np.ndarray, np.ndarray]:
 def test_exact_path_matches_a_walk_through_every_microsecond() -> None:
     events, (opens, closes) = stream(), (100, 900)
     middle = 487
-    found = follow(
-        events, (opens, closes), np.array([middle]), THRESHOLDS, direct(width=WIDTH, height=HEIGHT)
+    found = exposure_path(
+        events,
+        (opens, closes),
+        np.array([middle]),
+        THRESHOLDS,
+        pixel_spread(width=WIDTH, height=HEIGHT),
     )
     level = np.zeros((HEIGHT, WIDTH))
     total = np.zeros_like(level)
@@ -56,7 +60,7 @@ def test_exact_path_matches_a_walk_through_every_microsecond() -> None:
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_changes_add_over_time(rectified: bool) -> None:
-    events, spread = stream(rectified=rectified), direct(width=WIDTH, height=HEIGHT)
+    events, spread = stream(rectified=rectified), pixel_spread(width=WIDTH, height=HEIGHT)
     whole, left, right = (
         change_between(events, window, THRESHOLDS, spread)
         for window in ((100, 800), (100, 444), (444, 800))
@@ -65,8 +69,8 @@ def test_changes_add_over_time(rectified: bool) -> None:
 
 
 def test_change_at_an_instant_is_the_change_from_the_opening() -> None:
-    events, spread = stream(), direct(width=WIDTH, height=HEIGHT)
-    path = follow(events, (100, 900), np.array([100, 300, 900]), THRESHOLDS, spread)
+    events, spread = stream(), pixel_spread(width=WIDTH, height=HEIGHT)
+    path = exposure_path(events, (100, 900), np.array([100, 300, 900]), THRESHOLDS, spread)
     assert not path.change[0].any()
     torch.testing.assert_close(
         path.change[1], change_between(events, (100, 300), THRESHOLDS, spread)
@@ -77,9 +81,9 @@ def test_change_at_an_instant_is_the_change_from_the_opening() -> None:
 
 
 def test_a_still_pixel_and_an_instant_have_no_path() -> None:
-    events, spread = stream(), direct(width=WIDTH, height=HEIGHT)
-    still = follow(events[:0], (100, 900), np.array([500]), THRESHOLDS, spread)
-    instant = follow(events, (500, 500), np.array([500]), THRESHOLDS, spread)
+    events, spread = stream(), pixel_spread(width=WIDTH, height=HEIGHT)
+    still = exposure_path(events[:0], (100, 900), np.array([500]), THRESHOLDS, spread)
+    instant = exposure_path(events, (500, 500), np.array([500]), THRESHOLDS, spread)
     for path in (still, instant):
         assert not path.log_mean.any() and not path.change.any()
 
@@ -89,7 +93,9 @@ def test_rectified_event_is_shared_among_four_pixels() -> None:
         np.array([2.25], np.float32), np.array([1.5], np.float32), np.array([5]),
         np.ones(1, np.int8), WIDTH, HEIGHT,
     )  # fmt: skip
-    found = change_between(event, (0, 9), THRESHOLDS, direct(width=WIDTH, height=HEIGHT))[..., 0]
+    found = change_between(event, (0, 9), THRESHOLDS, pixel_spread(width=WIDTH, height=HEIGHT))[
+        ..., 0
+    ]
     expected = torch.zeros(HEIGHT, WIDTH)
     expected[1:3, 2], expected[1:3, 3] = 0.2 * 0.375, 0.2 * 0.125
     torch.testing.assert_close(found, expected)
@@ -115,9 +121,9 @@ def slow_demosaic(raw: np.ndarray, channel: int) -> np.ndarray:
 
 def test_colours_are_interpolated_as_in_bilinear_demosaicing() -> None:
     events = stream()
-    spread = covered(*grid(), width=WIDTH, height=HEIGHT)
+    spread = site_spread(*grid(), width=WIDTH, height=HEIGHT)
     found = change_between(events, (0, 1000), THRESHOLDS, spread, channel=tile(events))
-    mono = change_between(events, (0, 1000), THRESHOLDS, direct(width=WIDTH, height=HEIGHT))
+    mono = change_between(events, (0, 1000), THRESHOLDS, pixel_spread(width=WIDTH, height=HEIGHT))
     inner = (slice(1, -1), slice(1, -1))
     for channel in range(3):
         expected = slow_demosaic(mono[..., 0].numpy(), channel)
@@ -131,7 +137,7 @@ def test_colours_that_change_alike_everywhere_change_alike_in_every_pixel() -> N
         xy[:, 0].astype(np.int16), xy[:, 1].astype(np.int16), np.arange(1, n + 1),
         np.ones(n, np.int8), WIDTH, HEIGHT,
     )  # fmt: skip
-    spread = covered(xy, channel, width=WIDTH, height=HEIGHT)
+    spread = site_spread(xy, channel, width=WIDTH, height=HEIGHT)
     found = change_between(events, (0, n), THRESHOLDS, spread, channel=channel)
     reached = found != 0  # a corner may see no blue at all
     assert reached.float().mean() > 0.9
@@ -139,11 +145,11 @@ def test_colours_that_change_alike_everywhere_change_alike_in_every_pixel() -> N
 
 
 def test_halves_of_an_exposure_average_to_the_whole() -> None:
-    events, spread = stream(), direct(width=WIDTH, height=HEIGHT)
+    events, spread = stream(), pixel_spread(width=WIDTH, height=HEIGHT)
     none = np.zeros(0, np.int64)
-    whole = follow(events, (100, 900), none, THRESHOLDS, spread).log_mean.exp()
-    first = follow(events, (100, 500), none, THRESHOLDS, spread).log_mean.exp()
-    second = follow(events, (500, 900), none, THRESHOLDS, spread).log_mean.exp()
+    whole = exposure_path(events, (100, 900), none, THRESHOLDS, spread).log_mean.exp()
+    first = exposure_path(events, (100, 500), none, THRESHOLDS, spread).log_mean.exp()
+    second = exposure_path(events, (500, 900), none, THRESHOLDS, spread).log_mean.exp()
     moved = change_between(events, (100, 500), THRESHOLDS, spread).exp()
     torch.testing.assert_close(whole, (first + moved * second) / 2)
 
@@ -157,6 +163,8 @@ def test_one_step_in_the_middle_by_hand() -> None:
         6,
         5,
     )
-    path = follow(event, (0, 1000), np.array([499, 500]), THRESHOLDS, direct(width=6, height=5))
+    path = exposure_path(
+        event, (0, 1000), np.array([499, 500]), THRESHOLDS, pixel_spread(width=6, height=5)
+    )
     assert path.change[:, 1, 2, 0].tolist() == pytest.approx([0, -0.3])
     assert path.log_mean[1, 2, 0].item() == pytest.approx(math.log((1 + math.exp(-0.3)) / 2))

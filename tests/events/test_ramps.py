@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from sharpfield.core.events import EventStream
-from sharpfield.events.index import EventIndex, build
-from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
+from sharpfield.events.index import EventIndex, build_index
+from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import OVERSHOOT, RAMP_US, ramp_at, ramped_log_mean
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
@@ -22,7 +22,7 @@ def index_of(*events: tuple[int, int]) -> EventIndex:
     """Events (time in us, polarity) of the second of two pixels."""
     t_us, p = np.array(events).T
     ones, zeros = np.ones(len(p), np.int16), np.zeros(len(p), np.int16)
-    return build(EventStream(ones, zeros, t_us, p.astype(np.int8), width=2, height=1))
+    return build_index(EventStream(ones, zeros, t_us, p.astype(np.int8), width=2, height=1))
 
 
 def level(index: EventIndex, time_us: int) -> float:
@@ -85,7 +85,7 @@ def test_images_with_ramps_are_nearer_the_truth() -> None:
     assert frames.truth is not None
     index, off = event_index(capture.needed_events), []
     for used in (None, index):
-        made = SharpInstants(capture, moving, used)
+        made = LatentFrames(capture, moving, used)
         found = [made.at(int(t), SensorEstimate(0.2, 0.2)) for t in frames.exposure.middle_us]
         truth = torch.from_numpy(frames.truth / np.float32(frames.white))
         off.append(float((torch.stack(found) - truth).square().mean()))

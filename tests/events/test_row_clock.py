@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sharpfield.core.events import EventStream
-from sharpfield.events.counts import on_frame_clock
+from sharpfield.events.counts import subtract_row_delay
 from tests.streams import random_events
 
 
@@ -15,7 +15,7 @@ def stream() -> EventStream:
 
 def test_events_are_earlier_by_the_delay_of_their_row_and_in_order():
     events = stream()
-    seen = on_frame_clock(events, 100.0)
+    seen = subtract_row_delay(events, 100.0)
     assert (np.diff(seen.t_us) >= 0).all()
     back = list(zip(seen.t_us + 100 * seen.y.astype(int), seen.x, seen.y, seen.p, strict=True))
     assert sorted(back) == sorted(zip(events.t_us, events.x, events.y, events.p, strict=True))
@@ -24,7 +24,7 @@ def test_events_are_earlier_by_the_delay_of_their_row_and_in_order():
 
 def test_rows_exposed_one_after_the_other_have_the_same_events_in_one_window():
     events, opens, length = stream(), 1000, 800
-    seen = on_frame_clock(events, 100.0).window(opens, opens + length)
+    seen = subtract_row_delay(events, 100.0).window(opens, opens + length)
     for row in range(20):
         mine = events.t_us[events.y == row]
         late = opens + 100 * row
@@ -33,14 +33,14 @@ def test_rows_exposed_one_after_the_other_have_the_same_events_in_one_window():
 
 def test_a_global_shutter_changes_nothing():
     events = stream()
-    assert on_frame_clock(events, 0.0) is events
-    assert len(on_frame_clock(events[:0], 100.0)) == 0
+    assert subtract_row_delay(events, 0.0) is events
+    assert len(subtract_row_delay(events[:0], 100.0)) == 0
 
 
 def test_tracks_stay_with_their_events():
     events = stream()
     track = np.arange(len(events), dtype=np.int32)
-    seen = on_frame_clock(replace(events, track=track, tracks=len(events)), 100.0)
+    seen = subtract_row_delay(replace(events, track=track, tracks=len(events)), 100.0)
     assert seen.track is not None
     np.testing.assert_array_equal(events.p[seen.track], seen.p)
     np.testing.assert_array_equal(events.y[seen.track], seen.y)

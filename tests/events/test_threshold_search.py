@@ -6,7 +6,7 @@ import torch
 
 from sharpfield.core.events import EventStream
 from sharpfield.core.seed import generator
-from sharpfield.events.log_path import LogPath, change_between, direct, follow
+from sharpfield.events.log_path import LogPath, change_between, exposure_path, pixel_spread
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import (
     USUAL,
@@ -47,12 +47,12 @@ def watched() -> tuple[EventStream, torch.Tensor]:
 
 def test_disagreement_finds_the_threshold_of_each_sign() -> None:
     events, light = watched()
-    spread = direct(width=SIZE, height=SIZE)
+    spread = pixel_spread(width=SIZE, height=SIZE)
     usable = torch.ones_like(light, dtype=torch.bool)
 
     def cost(tried: FixedThresholds) -> float:
         paths = [
-            follow(events, window, np.array([middle]), tried, spread)
+            exposure_path(events, window, np.array([middle]), tried, spread)
             for window, middle in zip(WINDOWS, MIDDLES, strict=True)
         ]
         gap = change_between(events, (MIDDLES[0], MIDDLES[1]), tried, spread)

@@ -1,7 +1,7 @@
 import torch
 
 from sharpfield.core.tone import identity
-from sharpfield.formation.mixing import mix, mix_of_few
+from sharpfield.formation.mixing import mix, mix_with_few_gradients
 from tests.formation.toy import lit
 
 
@@ -43,7 +43,7 @@ def test_of_many_rays_a_few_give_the_gradient():
         lit(rgb[:, :2], torch.full((4, 2), 1 / 2)),
         lit(rgb[:, 2:], torch.full((4, 4), 1 / 6)),
     )
-    mean = mix_of_few(few, rest)
+    mean = mix_with_few_gradients(few, rest)
     torch.testing.assert_close(mean, rgb.mean(1))
     mean.square().sum().backward()
     pull = 2 * mean.detach()[:, None] / 2

@@ -8,7 +8,7 @@ import pytest
 from sharpfield.captures.native.layout import write
 from sharpfield.captures.read import read_capture
 from sharpfield.captures.writers import evdnerf as write_evdnerf
-from sharpfield.events.index import build, signed_sum
+from sharpfield.events.index import build_index, signed_sum
 from sharpfield.simulation.cameras.rigs import RING_FOCAL, ring
 from sharpfield.simulation.moving_capture import simulate_moving
 from sharpfield.simulation.scenes.moving import moving_scene
@@ -35,7 +35,7 @@ def capture():
 
 
 def test_events_of_two_windows_add_up(capture):
-    index = build(capture.needed_events)
+    index = build_index(capture.needed_events)
     site, ends = np.arange(index.sites), (0, 71_003, 150_001)
     a, b, c = (np.full(index.sites, t) for t in ends)
     parts = signed_sum(index, site, a, b) + signed_sum(index, site, b, c)
@@ -54,7 +54,7 @@ def test_reversed_time_turns_the_signs(capture):
     place = moving_scene("jelly")
     back = replace(place, bodies=replace(place.bodies, maps=Reversed(place).maps))
     made = simulate_moving(back, ring(3), rig=RIG, timing=TIMING)
-    forth, back = (build(one.needed_events) for one in (capture, made))
+    forth, back = (build_index(one.needed_events) for one in (capture, made))
     site = np.arange(forth.sites)
     ends = np.zeros(forth.sites, np.int64), np.full(forth.sites, TIMING.span_us() + 1)
     a, b = signed_sum(forth, site, *ends), signed_sum(back, site, *ends)

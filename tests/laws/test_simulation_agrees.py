@@ -14,7 +14,7 @@ import torch
 from sharpfield.core.capture import Capture
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.tone import tone_of
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
@@ -62,7 +62,7 @@ def test_blurry_frames_are_the_mean_of_true_light():
 @pytest.mark.parametrize("bayer", ["", "RGGB"])
 def test_events_are_the_change_of_true_log_light(bayer):
     capture = recorded(bayer)
-    table = pair_table(capture, build(capture.needed_events))
+    table = pair_table(capture, build_index(capture.needed_events))
     seen = draw_pairs(table, 2000, seed=0, step=0)
     contrast = LogContrast(capture.camera, capture.trajectory, FixedResponse())
     predicted = contrast.observe(truth(contrast.expose(seen)), seen)[:, 0]

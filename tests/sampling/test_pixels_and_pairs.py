@@ -9,7 +9,7 @@ from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.core.frames import Exposure, Frames
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.geometry.trajectory import Still
 from sharpfield.sampling.pixels_and_pairs import (
     draw_chains,
@@ -53,7 +53,7 @@ def capture(*, events=None, frames=3, test=(0,), dtype=np.uint8):
 
 
 def table_of(events, **options):
-    return pair_table(capture(events=events), build(events), **options)
+    return pair_table(capture(events=events), build_index(events), **options)
 
 
 def rows(struct, *names):

@@ -6,7 +6,7 @@ import pytest
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import checked
 from sharpfield.events.image import window_image
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.geometry.trajectory import Still, Tracks, count_tracks
 from sharpfield.simulation.cameras.rigs import (
     RING_FOCAL,
@@ -83,7 +83,7 @@ def test_events_of_each_camera_explain_what_it_saw(capture):
     for track in range(5):
         stream = capture.needed_events if track < 3 else capture.test_events
         size = {"width": 32, "height": 32, "track": track}
-        darker, brighter = np.moveaxis(window_image(build(stream), start, end, **size), -1, 0)
+        darker, brighter = np.moveaxis(window_image(build_index(stream), start, end, **size), -1, 0)
         pose = capture.trajectory.poses[track]
         logs = [
             np.log(view(place, capture.camera, pose, 1e-6 * t)[0] @ LUMA + 1e-5)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.storage import disk_cache, event_cache
 from sharpfield.storage.event_cache import (
     event_index,
@@ -89,7 +89,7 @@ def test_a_build_that_fails_leaves_nothing(path, monkeypatch):
 
 def test_the_index_of_a_mapped_stream_is_kept_beside_it(path):
     events = mapped(path)
-    index, expected = event_index(events), build(events)
+    index, expected = event_index(events), build_index(events)
     for name in ("site_xy", "offset", "t_us", "p"):
         np.testing.assert_array_equal(getattr(index, name), getattr(expected, name))
     (folder,) = (path.parent / "cache").glob("events-*/index-*")
@@ -131,7 +131,7 @@ def test_a_written_index_equals_the_one_in_memory(tmp_path, some_events, at_once
     if rectified:
         events = replace(events, x=events.x.astype(np.float32), y=events.y + np.float32(0.25))
     write_index(events, tmp_path, at_once=at_once)
-    index, stored = build(events), open_index(tmp_path, 1)
+    index, stored = build_index(events), open_index(tmp_path, 1)
     for name in ("site_xy", "offset", "t_us", "p"):
         np.testing.assert_array_equal(getattr(stored, name), getattr(index, name))
 
@@ -142,7 +142,7 @@ def test_the_written_index_of_a_rig_and_of_nothing(tmp_path, some_events):
     for name, one in (("rig", rig), ("none", events[:0])):
         (tmp_path / name).mkdir()
         write_index(one, tmp_path / name, at_once=100)
-        stored, index = open_index(tmp_path / name, one.tracks), build(one)
+        stored, index = open_index(tmp_path / name, one.tracks), build_index(one)
         assert len(stored) == len(index) and stored.sites == index.sites
         np.testing.assert_array_equal(stored.offset, index.offset)
         np.testing.assert_array_equal(stored.t_us, index.t_us)

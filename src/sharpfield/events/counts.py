@@ -1,10 +1,8 @@
-"""How many events each pixel of an image reported between two times.
+"""Numbers of events of each pixel between two times, and events aligned to a rolling shutter.
 
-Events on the clock of a rolling shutter.
-
-Each row of a frame opens and closes a little later than the one above. On a clock that is late by
-as much for each row, all rows are exposed at the same time again, and whatever compares frames and
-events of a pixel works as if the shutter were global.
+With a rolling shutter each row of a frame opens and closes a little later than the one above. If
+the events of each row are shifted in time by that delay, all rows are exposed at the same time, and
+code that compares frames and events of a pixel works as for a global shutter.
 """
 
 from dataclasses import replace
@@ -22,21 +20,21 @@ from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 
 TINY = 1e-9
-"""A threshold so small that events of its sign count for nothing."""
+"""A threshold so small that events of its sign do not count."""
 
 
 def counts_between(
     motion: EventMotion, start_us: int, end_us: int
 ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w c"]]:
-    """Minus the number of events to darker, and the number to brighter, after start, up to end.
+    """Minus the number of OFF events, and the number of ON events, with start < t <= end.
 
-    Whole numbers on a mono sensor whose events name pixels. Where positions are rectified or
-    pixels sit behind a colour filter they are interpolated as `LogPath` does, c = 3 with colours.
+    Whole numbers on a mono sensor with integer coordinates. For rectified positions and pixels
+    behind a colour filter they are interpolated as in `events.log_path`, with c = 3 for colours.
 
     Args:
         motion: The events.
         start_us: Not after the end.
-        end_us: See above.
+        end_us: Included.
     """
     events = motion.events
     if motion.channel is None and not events.rectified:
@@ -60,12 +58,12 @@ def _count(x, y, p, counts):
         counts[1 if p[i] > 0 else 0, y[i], x[i], 0] += 1
 
 
-def on_frame_clock(events: EventStream, row_delay_us: float) -> EventStream:
-    """The same events, each as much earlier as its row is read later, in order of these times.
+def subtract_row_delay(events: EventStream, row_delay_us: float) -> EventStream:
+    """The same events, each earlier by the readout delay of its row, sorted by these times.
 
     Args:
-        events: Of pixels of the frames.
-        row_delay_us: From one row to the next.
+        events: Of the same pixels as the frames.
+        row_delay_us: Readout delay from one row to the next.
     """
     if row_delay_us == 0 or not len(events):
         return events

@@ -27,7 +27,7 @@ from sharpfield.core.errors import OptionError, ShapeError
 from sharpfield.core.events import EventStream
 from sharpfield.core.tone import Tone, tone_of
 from sharpfield.events.image import splat_bilinear
-from sharpfield.events.log_path import LogPath, direct, follow
+from sharpfield.events.log_path import LogPath, exposure_path, pixel_spread
 from sharpfield.events.threshold import FixedThresholds
 
 STAMPS = 9
@@ -82,8 +82,8 @@ def edi(
             got=f"exposure {exposure_us} us, instants {instants.tolist()} us",
         )
     both = threshold if isinstance(threshold, tuple) else (threshold, threshold)
-    spread, tone = direct(width=events.width, height=events.height), tone_of(encoding)
-    path = follow(events, exposure_us, instants, FixedThresholds(*both), spread)
+    spread, tone = pixel_spread(width=events.width, height=events.height), tone_of(encoding)
+    path = exposure_path(events, exposure_us, instants, FixedThresholds(*both), spread)
     light = tone.decode(blurred)
     return torch.stack([tone.encode(latent(light, path, k)) for k in range(len(instants))])
 

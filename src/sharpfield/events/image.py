@@ -1,6 +1,6 @@
-"""Images of events: values at scattered positions summed into the pixels of an image.
+"""Event images: values at scattered positions, summed into the pixels of an image.
 
-Positions are in index units (10.0 is the centre of pixel 10); what falls outside is dropped.
+Positions are in index units (10.0 is the centre of pixel 10); values outside are dropped.
 """
 
 from typing import no_type_check
@@ -24,10 +24,7 @@ def splat_nearest(
 def splat_bilinear(
     xy: Float32[np.ndarray, "m 2"], value: Float64[np.ndarray, "m c"], *, width: int, height: int
 ) -> Float64[np.ndarray, "h w c"]:
-    """Share each value among the four pixels around it, by (1 - |dx|) (1 - |dy|).
-
-    A value exactly on a pixel goes there entirely.
-    """
+    """Distribute each value to the four pixels around it, with weights (1 - |dx|) (1 - |dy|)."""
     image = np.zeros((height, width, value.shape[1]))
     _bilinear(xy, value, image)
     return image
@@ -36,14 +33,14 @@ def splat_bilinear(
 def window_image(
     index: EventIndex, start_us: int, end_us: int, *, width: int, height: int, track: int = 0
 ) -> Float64[np.ndarray, "h w 2"]:
-    """How many events with start <= t < end got darker and brighter at each pixel.
+    """Numbers of OFF and ON events of each pixel with start <= t < end.
 
-    Rectified positions are shared bilinearly, so that counts need not be whole numbers.
+    Rectified positions are distributed bilinearly, so that counts need not be whole numbers.
 
     Args:
         index: The events.
-        start_us: The first instant that counts.
-        end_us: The first that no longer does.
+        start_us: Included.
+        end_us: Excluded.
         width: Of the image.
         height: Of the image.
         track: Whose events.
@@ -76,7 +73,7 @@ def _nearest(xy, value, image):
 def _bilinear(xy, value, image):
     for i in range(len(xy)):
         left, top = int(np.floor(xy[i, 0])), int(np.floor(xy[i, 1]))
-        right_share, lower_share = xy[i, 0] - left, xy[i, 1] - top
-        for row, share in ((top, 1 - lower_share), (top + 1, lower_share)):
-            _add(image, row, left, share * (1 - right_share), value[i])
-            _add(image, row, left + 1, share * right_share, value[i])
+        right, below = xy[i, 0] - left, xy[i, 1] - top
+        for row, weight in ((top, 1 - below), (top + 1, below)):
+            _add(image, row, left, weight * (1 - right), value[i])
+            _add(image, row, left + 1, weight * right, value[i])

@@ -1,12 +1,13 @@
-"""Events by place instead of by time: the same stream, sorted by pixel.
+"""An event stream sorted by pixel, then by time.
 
-Vocabulary: a *site* is a place that reports events, see `ops.event_sites`. The index stores the
-events of site 0, then those of site 1, and so on, each in the order of time; `offset` says where a
-site begins. Cameras follow each other: site = track * height * width + row * width + column. A
-*position* is a place in that order, so the next event of the same pixel is the next position, and
-"how many events between two times" is two binary searches.
+Vocabulary: a *site* is a pixel, or a rectified position, that can report events, see
+`events.sites`. The index stores the events of site 0, then those of site 1, and so on, each in
+order of time; the events of a site begin at its `offset`. Cameras follow each other: site = track *
+height * width + row * width + column. A *position* is an index into that order: the next event of
+the same pixel is at the next position, and the number of events between two times takes two binary
+searches.
 
-It is built by a counting sort: one pass over the stream counts, one places. All arrays are numpy
+It is built by a counting sort: one pass over the stream counts, one writes. All arrays are numpy
 and may be memory-mapped, see `storage.event_cache`; images of it are in `events.image`.
 """
 
@@ -37,7 +38,7 @@ class EventIndex:
     t_us: Int64[np.ndarray, "n"]
     p: Int8[np.ndarray, "n"]
     tracks: int = 1
-    """How many cameras there are; each has the same number of sites."""
+    """Number of cameras; each has the same number of sites."""
 
     def __len__(self) -> int:
         """Number of events."""
@@ -58,27 +59,27 @@ class EventIndex:
         return np.arange(track * each, (track + 1) * each)
 
 
-def build(events: EventStream) -> EventIndex:
+def build_index(events: EventStream) -> EventIndex:
     """The index of a stream, in memory.
 
     Raises:
         CaptureError: An event lies outside the sensor, or times go back at some pixel.
     """
     site_xy, site_of = find_sites(events)
-    offset = count(events, site_of, len(site_xy))
-    t_us, p = place(events, site_of, offset, first=0, last=len(site_xy))
+    offset = site_offsets(events, site_of, len(site_xy))
+    t_us, p = sort_sites(events, site_of, offset, first=0, last=len(site_xy))
     return EventIndex(site_xy, offset, t_us, p, events.tracks)
 
 
-def count(events: EventStream, site_of: SiteOf, sites: int) -> Int64[np.ndarray, "o"]:
-    """Where each site's events will begin, o = m + 1: the first pass of the sort."""
+def site_offsets(events: EventStream, site_of: SiteOf, sites: int) -> Int64[np.ndarray, "o"]:
+    """The offset of each site, o = m + 1: the first pass of the sort."""
     offset = np.zeros(sites + 1, np.int64)
     for part in parts(events):
         _count(site_of(part), offset[1:])
     return np.cumsum(offset)
 
 
-def place(
+def sort_sites(
     events: EventStream,
     site_of: SiteOf,
     offset: Int64[np.ndarray, "o"],
@@ -139,8 +140,8 @@ def window(
 ) -> tuple[Int64[np.ndarray, "b"], Int64[np.ndarray, "b"]]:
     """Positions `first` ... `last - 1` of each site's events with start <= t < end.
 
-    Times are whole us, so the events after `a` up to and including `b` are those in
-    [a + 1, b + 1). The number of events is `last - first`.
+    Times are whole us, so the events after `a` up to and including `b` are those with
+    a + 1 <= t < b + 1. The number of events is `last - first`.
     """
     return _window(index.offset, index.t_us, site, start_us, end_us)
 
@@ -148,7 +149,7 @@ def window(
 def counts(
     index: EventIndex, first: Int[np.ndarray, "b"], last: Int[np.ndarray, "b"]
 ) -> tuple[Int64[np.ndarray, "b"], Int64[np.ndarray, "b"]]:
-    """How many of the events at positions `first` ... `last - 1` got darker, and brighter.
+    """Numbers of OFF and of ON events at positions `first` ... `last - 1`.
 
     Args:
         index: The events.
@@ -171,9 +172,9 @@ def signed_sum(
 
 
 def chains(index: EventIndex, hops: int = 1) -> Int64[np.ndarray, "o"]:
-    """Where each site's events that have at least `hops` successors begin, among all of these.
+    """Offset of each site in the list of all events that have at least `hops` successors.
 
-    The last entry is how many there are; draw a rank below it and call `chain_start`.
+    The last entry is the length of that list; draw a rank below it and call `chain_start`.
     """
     found = np.maximum(np.diff(index.offset) - hops, 0)
     return np.concatenate([[0], np.cumsum(found)]).astype(np.int64)
@@ -273,9 +274,9 @@ def _previous(offset, t_us, site, time):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _window(offset, t_us, site, start_us, end_us):
-    """Both ends of many windows; a group at a time, step by step together.
+    """Both ends of many windows, by binary searches that advance in groups.
 
-    A binary search waits for memory at each step; the steps of a group do not depend on each
+    A binary search waits for memory at each step; searches of a group do not depend on each
     other, so that the CPU waits for many at once (1.5 times the speed of one by one).
     """
     first, last = np.empty(site.size, np.int64), np.empty(site.size, np.int64)

@@ -1,8 +1,9 @@
-"""Sharp images at any time of a capture, by the event double integral.
+"""Latent frames: sharp images at any time of a capture, by the event double integral.
 
-Each exposure says how bright every pixel was on average, the events how its light moved before,
-during and after (see `formation.edi`). Inside an exposure its own image is carried to the
-instant; between two exposures both are, and their log light is averaged by how near they are.
+The blurred frame gives the mean light of each pixel over its exposure, the events the change
+before, during and after it (`events.double_integral`). At an instant inside an exposure its own
+frame is integrated to that instant; between two exposures both are, and their log light is averaged
+with weights by distance in time.
 """
 
 from dataclasses import dataclass
@@ -24,24 +25,24 @@ from sharpfield.events.threshold import FixedThresholds
 
 @dataclass(frozen=True)
 class SensorEstimate:
-    """What is believed of the event camera."""
+    """Estimated thresholds and clock offset of the event camera."""
 
     negative: float
     """Contrast threshold to darker."""
     positive: float
     """Contrast threshold to brighter."""
     late_us: int = 0
-    """By how much its clock is late against that of the frames."""
+    """Its clock minus the clock of the frames."""
 
 
-class SharpInstants:
-    """Images between the first and the last exposure of the training frames.
+class LatentFrames:
+    """Sharp images between the first and the last exposure of the training frames.
 
     Args:
         capture: With frames and events.
         motion: Of its events.
-        index: Of its events, where they name the pixels of a mono sensor; light then moves between
-            events in ramps, otherwise in steps.
+        index: Of its events, if they are of the pixels of a mono sensor; light between two events
+            is then piecewise linear (`events.ramps`), otherwise a staircase.
     """
 
     def __init__(
@@ -62,8 +63,8 @@ class SharpInstants:
         """The image at a time, as the frames would store it.
 
         Args:
-            time_us: By the clock of the frames.
-            sensor_estimate: In what the events say.
+            time_us: On the clock of the frames.
+            sensor_estimate: Thresholds and clock offset of the events.
         """
         exposure = self.frames.exposure
         away = np.maximum(
@@ -72,22 +73,22 @@ class SharpInstants:
         away = np.maximum(away, 0)
         nearest = [int(i) for i in np.argsort(away, kind="stable")[:2]]
         if away[nearest[0]] == 0 or len(nearest) == 1:
-            return self._developed(
+            return self._encode(
                 self._log_light(int(self.order[nearest[0]]), time_us, sensor_estimate)
             )
         one, other = (
             self._log_light(int(self.order[i]), time_us, sensor_estimate) for i in nearest
         )
-        share = float(away[nearest[1]] / away[nearest].sum())
-        return self._developed(share * one + (1 - share) * other)
+        weight = float(away[nearest[1]] / away[nearest].sum())
+        return self._encode(weight * one + (1 - weight) * other)
 
-    def _developed(self, log_light: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
+    def _encode(self, log_light: Float[Tensor, "h w c"]) -> Float[Tensor, "h w c"]:
         return self.tone.encode(log_light.exp().clamp(0, 1))
 
     def _log_light(
         self, frame: int, time_us: int, sensor_estimate: SensorEstimate
     ) -> Float[Tensor, "h w c"]:
-        """What one exposure and the events from its opening to a time say."""
+        """Log light at a time, from one exposure and the events between its opening and then."""
         opens = int(self.frames.exposure.open_us[frame])
         first, last = (
             min(opens, time_us) + sensor_estimate.late_us,
@@ -108,7 +109,7 @@ class SharpInstants:
         )
 
     def _log_mean(self, frame: int, sensor_estimate: SensorEstimate) -> Float[Tensor, "h w c"]:
-        """Of one exposure, relative to its opening; kept for the belief that was asked last."""
+        """Log of the mean of one exposure, relative to its opening; cached for the last one."""
         if (frame, sensor_estimate) not in self._log_means:
             for known in [key for key in self._log_means if key[0] == frame]:
                 del self._log_means[known]

@@ -1,14 +1,14 @@
-"""How the log light of every pixel moves, as its events tell.
+"""The change of log light of every pixel over an exposure, integrated from its events.
 
-Each event says that the log light of its place changed by one threshold. A *path* follows that
-change over one exposure: it knows the change at some instants, and the time average of exp(change)
-over the exposure, which is what motion blur does to a pixel. Between events the light is taken as
-constant, so the average is a finite sum and exact: nothing is sliced.
+Each event changes the log light of its pixel by one threshold. A *path* is that change over one
+exposure: its value at some instants, and the time average of exp(change) over the exposure, which
+is the factor between a blurred and a sharp pixel. Light is taken as constant between events, so the
+average is a finite sum and exact: there are no time slices.
 
-Events act on one channel, which stands for all colours, or behind a colour filter on their own:
-then the change of a colour is interpolated from the pixels that see it, as in bilinear
-demosaicing, because the change of log light is what is smooth. Rectified positions spread over
-the pixels around them.
+Events act on one channel, which stands for all colours, or, behind a colour filter, on the colour
+of that filter: the change of a colour is then interpolated from the pixels that have its filter, as
+in bilinear demosaicing, since the change of log light is smooth where light itself is not.
+Rectified positions act on the four pixels around them.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from sharpfield.events.threshold import FixedThresholds
 
 GREEN = 1
 SEEN = 1e-3
-"""Share of a site below which a pixel counts as not seen by it."""
+"""Total weight of all sites below which a pixel counts as reached by none."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class LogPath:
     log_mean: Float[Tensor, "h w c"]
     """Log of the time average of exp(change) over the exposure."""
     change: Float[Tensor, "k h w c"]
-    """At each of the instants asked for."""
+    """At each of the instants."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How a site's change of log light reaches the pixels of the image."""
+    """How the change of log light at sites is distributed to the pixels of the image."""
 
     coverage: Float64[np.ndarray, "h w c"]
-    """Total share of all sites at each pixel, by which shares are divided."""
+    """Sum of the weights of all sites at each pixel, by which weights are divided."""
     reach: int
-    """Pixels to each side that a site reaches: 1, or 2 where colours must be interpolated."""
+    """Pixels to each side that a site acts on: 1, or 2 where colours must be interpolated."""
 
     @property
     def size(self) -> tuple[int, int, int]:
@@ -54,19 +54,19 @@ class Spread:
         return height, width, channels
 
 
-def direct(*, width: int, height: int) -> Spread:
-    """Mono sensor: a site is a pixel, or shares its change among the four pixels around it."""
+def pixel_spread(*, width: int, height: int) -> Spread:
+    """Mono sensor: a site is a pixel, or distributes its change to the four pixels around it."""
     return Spread(np.ones((height, width, 1)), reach=1)
 
 
-def covered(
+def site_spread(
     site_xy: Float32[np.ndarray, "m 2"],
     channel: Int8[np.ndarray, "m"] | None,
     *,
     width: int,
     height: int,
 ) -> Spread:
-    """A known set of sites: every pixel takes the weighted mean of the sites around it.
+    """A known set of sites: every pixel gets the weighted mean of the sites around it.
 
     Args:
         site_xy: Column and row of all sites, in index units.
@@ -82,12 +82,12 @@ def covered(
         colour=np.zeros(len(site_xy), np.int8) if channel is None else channel,
         step=np.ones(len(site_xy)),
     )
-    everywhere = Spread(np.ones((height, width, channels)), reach)
-    total = _Progress.at_rest(everywhere, 0).after(sites, everywhere).level
+    unweighted = Spread(np.ones((height, width, channels)), reach)
+    total = _Progress.at_rest(unweighted, 0).after(sites, unweighted).level
     return Spread(np.where(total < SEEN, np.inf, total), reach)
 
 
-def follow(
+def exposure_path(
     events: EventStream,
     window_us: tuple[int, int],
     instants_us: Int64[np.ndarray, "k"],
@@ -101,9 +101,9 @@ def follow(
     Args:
         events: At least those of the exposure.
         window_us: Opening and closing of the shutter. At a single instant nothing changes.
-        instants_us: Where to report the change; ascending, inside the exposure.
+        instants_us: When to report the change; ascending, inside the exposure.
         thresholds: For each sign.
-        spread: From `direct` or `covered`.
+        spread: From `pixel_spread` or `site_spread`.
         channel: Colour of each event of `events`; required when `spread` has colours.
     """
     opens, closes = window_us
@@ -139,7 +139,7 @@ def _tensor(values: Float64[np.ndarray, "*b"]) -> Float[Tensor, "*b"]:
 
 @dataclass(frozen=True)
 class _Steps:
-    """Events as steps of log light at places."""
+    """Events as steps of log light at positions."""
 
     t_us: Int64[np.ndarray, "n"]
     xy: Float32[np.ndarray, "n 2"]
@@ -159,18 +159,18 @@ def _steps(
     """The events after the first time up to and including the second."""
     first, last = np.searchsorted(events.t_us, window_us, side="right")
     part = slice(int(first), int(last))
-    seen = events[part]
+    inside = events[part]
     return _Steps(
-        t_us=np.asarray(seen.t_us),
-        xy=np.stack([seen.x, seen.y], -1).astype(np.float32),
-        colour=np.zeros(len(seen), np.int8) if channel is None else channel[part],
-        step=np.where(seen.p > 0, thresholds.positive, -thresholds.negative),
+        t_us=np.asarray(inside.t_us),
+        xy=np.stack([inside.x, inside.y], -1).astype(np.float32),
+        colour=np.zeros(len(inside), np.int8) if channel is None else channel[part],
+        step=np.where(inside.p > 0, thresholds.positive, -thresholds.negative),
     )
 
 
 @dataclass(frozen=True)
 class _Progress:
-    """Where every pixel has got to on its way."""
+    """State of the integration at every pixel."""
 
     level: Float64[np.ndarray, "h w c"]
     """Change of log light since the beginning."""
@@ -186,10 +186,10 @@ class _Progress:
         )
 
     def after(self, steps: _Steps, spread: Spread) -> "_Progress":
-        """One step after the other, in order of time."""
+        """The state after some more steps, in order of time."""
         level, area, since = self.level.copy(), self.area.copy(), self.since_us.copy()
-        place = (spread.reach, spread.coverage)
-        _walk(steps.t_us, steps.xy, steps.colour, steps.step, place, level, area, since)
+        weights = (spread.reach, spread.coverage)
+        _integrate(steps.t_us, steps.xy, steps.colour, steps.step, weights, level, area, since)
         return _Progress(level, area, since)
 
     def log_mean(self, begin_us: int, end_us: int) -> Float64[np.ndarray, "h w c"]:
@@ -202,27 +202,28 @@ class _Progress:
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _walk(t_us, xy, colour, step, place, level, area, since):
-    reach, coverage = place
+def _integrate(t_us, xy, colour, step, weights, level, area, since):
+    reach, coverage = weights
     for i in range(t_us.size):
         x, y, c = xy[i, 0], xy[i, 1], colour[i]
         left, top = int(np.floor(x)) + 1 - reach, int(np.floor(y)) + 1 - reach
         for row in range(max(top, 0), min(top + 2 * reach, level.shape[0])):
             for column in range(max(left, 0), min(left + 2 * reach, level.shape[1])):
-                share = _share(x - column, y - row, reach, c)
-                if share > 0:
+                weight = _weight(x - column, y - row, reach, c)
+                if weight > 0:
                     at = row, column, c
                     area[at] += np.exp(level[at]) * (t_us[i] - since[at])
                     since[at] = t_us[i]
-                    level[at] += step[i] * share / coverage[at]
+                    level[at] += step[i] * weight / coverage[at]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _share(dx, dy, reach, colour):
-    """Bilinear weight in the lattice of the site's kind.
+def _weight(dx, dy, reach, colour):
+    """Bilinear weight in the lattice of the site's colour.
 
-    That is all pixels; every second one in both directions; or, for green, a chessboard.
+    The lattice is all pixels on a mono sensor, every second one in both directions for red and
+    blue, and a checkerboard for green.
     """
     if reach == 2 and colour == GREEN:
         dx, dy = dx + dy, dx - dy

@@ -1,4 +1,4 @@
-"""How the light of a capture moved, as its events tell: for any exposure, or between two times."""
+"""The change of log light of a capture, from its events: over an exposure or between two times."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,15 @@ from torch import Tensor
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.events.index import build
-from sharpfield.events.log_path import LogPath, Spread, change_between, covered, direct, follow
+from sharpfield.events.index import build_index
+from sharpfield.events.log_path import (
+    LogPath,
+    Spread,
+    change_between,
+    exposure_path,
+    pixel_spread,
+    site_spread,
+)
 from sharpfield.events.site_colour import site_channels
 from sharpfield.events.sites import find_sites, parts
 from sharpfield.events.threshold import FixedThresholds
@@ -18,7 +25,7 @@ from sharpfield.events.threshold import FixedThresholds
 
 @dataclass(frozen=True)
 class EventMotion:
-    """The events of a capture, with how they act on the pixels of its frames."""
+    """The events of a capture, and how they act on the pixels of its frames."""
 
     events: EventStream
     spread: Spread
@@ -27,7 +34,7 @@ class EventMotion:
 
     @classmethod
     def of(cls, capture: Capture) -> "EventMotion":
-        """The motion that a capture's events tell.
+        """From the events of a capture.
 
         Raises:
             CaptureError: There are no events, they and the frames differ in size, or they come
@@ -51,13 +58,13 @@ class EventMotion:
             )
         size = {"width": events.width, "height": events.height}
         if not events.coloured:
-            return cls(events, direct(**size), None)
+            return cls(events, pixel_spread(**size), None)
         if (known := events.site_colour) is not None:
             xy = np.stack([known.x, known.y], -1).astype(np.float32)
-            return cls(events, covered(xy, known.channel, **size), _channels(events))
-        index = build(events[:0])  # every pixel is a site
+            return cls(events, site_spread(xy, known.channel, **size), _channels(events))
+        index = build_index(events[:0])  # every pixel is a site
         colours = site_channels(events, index)
-        return cls(events, covered(index.site_xy, colours, **size), _channels(events))
+        return cls(events, site_spread(index.site_xy, colours, **size), _channels(events))
 
     def path(
         self,
@@ -65,8 +72,8 @@ class EventMotion:
         instants_us: Int64[np.ndarray, "k"],
         thresholds: FixedThresholds,
     ) -> LogPath:
-        """Over one exposure, see `formation.log_path.follow`."""
-        return follow(
+        """Over one exposure, see `formation.log_path.exposure_path`."""
+        return exposure_path(
             self.events, window_us, instants_us, thresholds, self.spread, channel=self.channel
         )
 
@@ -82,6 +89,6 @@ class EventMotion:
 def _channels(events: EventStream) -> Int8[np.ndarray, "n"]:
     """The colour of each event, by the colour of its site."""
     _, site_of = find_sites(events)
-    channel = site_channels(events, build(events))
+    channel = site_channels(events, build_index(events))
     assert channel is not None, "only called for coloured events"
     return np.concatenate([channel[site_of(part)] for part in parts(events)] or [channel[:0]])

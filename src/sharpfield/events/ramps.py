@@ -1,20 +1,20 @@
-"""How far each pixel is on its way from one event to the next.
+"""Log light of a pixel between two of its events: the fraction of a threshold since the last one.
 
-An event says that a whole threshold is behind; at any other time the log light of a pixel is
-somewhere between its last event and its next one. Where both have the same sign, the light has
-been moving one way, and the share of the time between them tells the share of the threshold: the
-*phase*. Where they differ the light turned around at a height nobody knows, less than a threshold
-beyond the last event. If every height is as likely and the light turns as a thrown stone does, it
-spent the time a third of a threshold beyond, on average, and only at last fell to the next event.
-Left out, this *overshoot* is what makes counts of events too few after a turn, and thresholds
-that explain them too large.
+At an event the log light of a pixel has changed by a whole threshold since the one before; at any
+other time it lies in between. The *phase* is the signed fraction of a threshold since the last
+event.
 
-The log light of every pixel as a broken line through its events, instead of a staircase.
+- Two events of the same sign: the light changed in one direction, and the phase is taken as linear
+  in time.
+- Two events of opposite signs: the light turned around at an unknown level, less than one threshold
+  beyond the first event. If all levels are equally likely and the light turns along a parabola, it
+  was a third of a threshold beyond the first event, on average over that time, and fell to the
+  second event only shortly before it. Without this *overshoot*, counts of events after a turn are
+  too small, and thresholds fitted to them too large.
 
-A staircase rises when a threshold is already behind, so that all it says is late, by a millisecond
-or so: images made from it show where things were. Between two events a *ramp* lets the light
-move in the last part of the time before the second one. Where light turns it has gone a little
-beyond its last event, see `formation.event_phase`.
+Counted events form a staircase, which rises only when a whole threshold has been passed: it is late
+by about a millisecond, and so are images made from it. The piecewise-linear light used here
+instead has a *ramp* before each event: the light changes in the last part of the time before it.
 """
 
 import math
@@ -29,20 +29,20 @@ from torch import Tensor
 from sharpfield.events.index import EventIndex, first_since
 
 LONGEST_US = 20_000
-"""Between two events farther apart than this the light may have stood still for a while."""
+"""Between two events farther apart than this the light may have been constant for a while."""
 
 OVERSHOOT = 1 / 3
-"""Mean height beyond the last event until the light turns back: half of a threshold at the top,
-two thirds of that over the time. Half as much before another event of the same sign."""
+"""Mean level beyond the last event while the light turns back, in thresholds: 1/2 is the expected
+peak, and a parabola's mean is 2/3 of its peak. Half as much before an event of the same sign."""
 
 FALL_US, FALL_SHARE = 4_000, 0.4
-"""The light falls to its next event within this time, or this share of the time between the two."""
+"""The light falls to its next event within this time, or this fraction of the time between them."""
 
 
 def phase_at(
     index: EventIndex, time_us: int, *, width: int, height: int
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """The signed part of an event that each pixel saw since its last one, and where it is known.
+    """The phase of each pixel at a time, and where it is known.
 
     Args:
         index: Of a mono sensor whose events name pixels, so that its sites are the pixels.
@@ -51,7 +51,8 @@ def phase_at(
         height: Of the sensor.
 
     Returns:
-        -1...1, what is likely where it is not known; and whether it is known.
+        The phase, -1...1, with its expected value where it is not known; and whether it is known,
+        which it is between two close events of the same sign.
     """
     assert index.sites == width * height, "sites are the pixels of the sensor"
     phase = np.zeros(index.sites, np.float32)
@@ -89,11 +90,12 @@ def _phases(offset, t_us, p, time_us, phase, known):
 
 
 RAMP_US = 7_000
-"""Longest ramp; what moves slower stood still before. 5 to 10 ms serve a hand-held camera best."""
+"""Longest ramp; before it the light is taken as constant. 5 to 10 ms are best for a hand-held
+camera."""
 
 
 def ramp_at(index: EventIndex, time_us: int, size: tuple[int, int]) -> Float[Tensor, "h w 2"]:
-    """Parts of an event to darker (-1...0) and to brighter (0...1) since the last one.
+    """The phase at a time, apart by sign: to darker (-1...0) and to brighter (0...1).
 
     Args:
         index: Of a mono sensor whose events name pixels.
@@ -136,7 +138,7 @@ def _begin(t_us, first, event):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _beyond(t_us, p, first, event, last):
-    """Signed height of the light beyond the event before this one, until the ramp, in events."""
+    """Signed level beyond the event before this one, until the ramp begins, in thresholds."""
     if event == first:
         return 0.0
     height = OVERSHOOT * p[event - 1]
@@ -164,7 +166,7 @@ def _ramps(offset, t_us, p, time_us, parts):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _area(level, begin, end, slope_from, step, ramp):
-    """Integral of exp(level + ramp) from one time to another; the ramp rises from `slope_from`."""
+    """Integral of exp(level + ramp) from one time to another; the ramp starts at `slope_from`."""
     flat_end = min(max(slope_from, begin), end)
     area = math.exp(level) * (flat_end - begin)
     if end > flat_end:
@@ -195,7 +197,7 @@ def _log_means(offset, t_us, p, window_us, thresholds, mean):
                 ramp = max(t_us[event] - slope_from, 1)
                 end = min(closes, t_us[event])
             if not started:
-                # Relative to the opening, which may lie on a ramp.
+                # Relative to the opening, which may be on a ramp.
                 level = -beyond - (step - beyond) * max(opens - slope_from, 0) / ramp
                 started = True
             area += _area(level + beyond, now, end, slope_from, step - beyond, ramp)

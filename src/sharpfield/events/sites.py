@@ -1,9 +1,11 @@
-"""Which places of a sensor report events: its pixels, or the distinct positions of rectified ones.
+"""Sites: the pixels of an event camera, or the distinct positions of rectified events.
 
-A *site* is such a place. Sites are numbered by row, then by column. On a sensor with integer
-coordinates every pixel is a site, whether it ever fires or not; rectified positions are collected
-from the stream itself with a hash table of their bits, since a position is only ever compared
-with itself. Cameras of several tracks have their own sites: first all of track 0, then of track 1.
+Sites are numbered by row, then by column. With integer coordinates every pixel is a site, whether
+it ever fires or not. Rectified positions are collected from the stream itself, with a hash table of
+the bits of their coordinates: two events are of one site if their positions are exactly equal.
+Cameras of several tracks have their own sites: first all of track 0, then those of track 1.
+
+On a colour sensor each site is behind one colour filter, see `events.site_colour`.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,10 +19,10 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 
 CHUNK = 2**22
-"""Events looked at together; bounds the temporary memory."""
+"""Events processed at once; bounds the temporary memory."""
 
 SiteOf = Callable[[EventStream], Int32[np.ndarray, "n"]]
-"""Names the site of each event of a part of the stream."""
+"""The site of each event of a part of the stream."""
 
 
 def parts(events: EventStream) -> Iterator[EventStream]:
@@ -30,7 +32,7 @@ def parts(events: EventStream) -> Iterator[EventStream]:
 
 
 def find_sites(events: EventStream) -> tuple[Float32[np.ndarray, "m 2"], SiteOf]:
-    """All sites of a stream, and the function that names the site of each event.
+    """All sites of a stream, and the function that gives the site of each event.
 
     Returns:
         site_xy: Column and row of each site, ascending by track, then by row, then by column.
@@ -96,7 +98,7 @@ def _rectified_sites(events: EventStream) -> tuple[Float32[np.ndarray, "m 2"], S
 
 
 def _bits(position: Shaped[np.ndarray, "n"]) -> UInt32[np.ndarray, "n"]:
-    """The bits of float32 positions; adding zero makes -0.0 the same place as 0.0."""
+    """The bits of float32 positions; adding zero makes -0.0 equal to 0.0."""
     return (np.asarray(position, np.float32) + np.float32(0)).view(np.uint32)
 
 
@@ -121,7 +123,7 @@ def _number_pixels(
 @njit(cache=True, nogil=True)
 @no_type_check
 def _slot(key: np.uint64, table: Int32[np.ndarray, "h"], keys: UInt64[np.ndarray, "k"]) -> int:
-    """Where in the table `key` is, or the free place where it belongs (linear probing)."""
+    """The slot of `key` in the table, or the free slot where it belongs (linear probing)."""
     mask = np.uint64(table.size - 1)
     mixed = (key ^ (key >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
     slot = (mixed >> np.uint64(24)) & mask
@@ -162,7 +164,7 @@ def _collect(
 @njit(cache=True, nogil=True)
 @no_type_check
 def _enter(keys: UInt64[np.ndarray, "k"], table: Int32[np.ndarray, "h"]) -> None:
-    """Put numbered keys into an empty table."""
+    """Enter numbered keys into an empty table."""
     for number in range(keys.size):
         table[_slot(keys[number], table, keys)] = number
 

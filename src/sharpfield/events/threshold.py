@@ -1,6 +1,6 @@
-"""Contrast thresholds: how much the log intensity changes for one event, for each sign.
+"""Contrast thresholds: the change of log intensity that makes one event, for each sign.
 
-A threshold is called with event pairs and gives the two thresholds that hold at each, ready for
+A threshold object is called with event pairs and returns the two thresholds at each of them, for
 `EventPairs.measured`:
 
     change = pairs.measured(*thresholds(pairs))
@@ -51,9 +51,9 @@ class FixedThresholds:
 class LearnedThresholds(nn.Module):
     """Thresholds learned as a factor on a first guess, in log space; they stay positive.
 
-    They cannot be learned from events alone: any common factor can be taken up by the scene's
-    contrast. Together with frames they can, and `prior` keeps them near the guess where nothing
-    else holds them.
+    They cannot be learned from events alone, since any common factor can be absorbed by the scene's
+    contrast. Together with frames they can; `prior` keeps them near the guess where the data do not
+    determine them.
 
     Args:
         negative: First guess, to darker.

@@ -1,17 +1,17 @@
-"""Finding the contrast threshold of a recording from its own blurred frames and events.
+"""Estimating the contrast thresholds of a recording from its own blurred frames and events.
 
-Two judges say how well a threshold explains a recording; lower is better.
+Two costs measure how well a threshold explains a recording; lower is better.
 
-*Disagreement*: each exposure by itself says what the light was at its middle, and so does its
-neighbour plus the events between the two. Only the right threshold makes them agree, for any
-scene that moves, without any idea of what a sharp image looks like.
+*Disagreement*: the light at the middle of an exposure follows from that exposure alone, and also
+from its neighbour and the events in between. Only the right threshold makes the two agree, for any
+scene that moves, and without a model of what a sharp image looks like.
 
-*Density of edges*: the mean length of the gradient over its root mean square, where events were.
-Blur and noise both fill a image with small gradients, sharp edges are few and tall; so the number
-balances total variation against edge strength, which is how the EDI paper chooses. It serves
-where a single frame is all there is. Alone it is easily fooled (exaggerated edges are taller
-still, and a frame with little blur says next to nothing), hence a mild pull towards the threshold
-most sensors are set to.
+*Edge density*: the mean length of the gradient over its root mean square, at pixels with events.
+Blur and noise both produce many small gradients, sharp edges few large ones; so the number
+balances total variation against edge strength, which is how the EDI paper chooses. It needs only a
+single frame. Alone it is unreliable (exaggerated edges are stronger still, and a frame with little
+blur is hardly affected by the threshold), hence a weak prior towards the threshold that most
+sensors are set to.
 
 Sources: Pan et al. (CVPR 2019), section 3.3; Krishnan et al., "Blind deconvolution using a
 normalized sparsity measure" (CVPR 2011).
@@ -32,13 +32,13 @@ LOWEST, HIGHEST = 0.02, 1.2
 """Thresholds searched, in natural log. Sensors are set to 0.1 ... 0.5."""
 
 USUAL, PULL = 0.2, 0.03
-"""Threshold towards which a single frame's choice is pulled, and how strongly."""
+"""Threshold that the prior for a single frame favours, and its weight."""
 
 COARSE = 10
-"""Thresholds tried before the best one's neighbourhood is searched."""
+"""Thresholds tried before the search around the best of them."""
 
 SILENT = 0.02
-"""Share of pixels without events that is enough to tell a change of gain."""
+"""Fraction of pixels without events that is enough to estimate a change of gain."""
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -51,13 +51,13 @@ def disagreement(
     gaps: Float[Tensor, "g h w c"],
     usable: Bool[Tensor, "n h w c"],
 ) -> float:
-    """Mean distance, in log light, between what neighbouring exposures say of each other.
+    """Mean difference, in log light, between neighbouring exposures brought to the same instant.
 
-    Pixels without events tell what gain or exposure time changed between two frames; that factor
-    is taken out first. All others are judged.
+    A change of gain or exposure time between two frames is estimated from pixels without events and
+    removed first. All other pixels count.
 
     Args:
-        light: Of the blurred frames, linear: luma, or the colours that the paths tell apart.
+        light: Of the blurred frames, linear: luma, or the colours that the paths distinguish.
         paths: Of each exposure, with its middle as the first instant.
         gaps: Change of log light from each middle to the next, g = n - 1.
         usable: Pixels that are neither too dark nor saturated.
@@ -69,21 +69,21 @@ def disagreement(
     apart = alone[1:] - alone[:-1] - gaps
     total, count = 0.0, 0
     for distance, active, good in zip(apart, moved, usable[1:] & usable[:-1], strict=True):
-        silent, judged = distance[good & ~active], distance[good & active]
+        silent, changed = distance[good & ~active], distance[good & active]
         gain = silent.median() if len(silent) >= SILENT * distance.numel() else 0.0
-        total += float((judged - gain).abs().sum())
-        count += len(judged)
+        total += float((changed - gain).abs().sum())
+        count += len(changed)
     return total / count if count else math.inf
 
 
 def edge_density(
     image: Float[Tensor, "h w 1"], where: Bool[Tensor, "h w 1"] | None = None
 ) -> float:
-    """Mean over root mean square of the gradient's length: 1 if everywhere alike, 0 if sparse.
+    """Mean over root mean square of the gradient's length: 1 if equal everywhere, 0 if sparse.
 
     Args:
-        image: Display-referred, so that edges count as they are seen.
-        where: The pixels to look at; all by default.
+        image: Display-referred values.
+        where: The pixels that count; all by default.
     """
     grey = image[..., 0]
     right, down = grey[:-1, 1:] - grey[:-1, :-1], grey[1:, :-1] - grey[:-1, :-1]
@@ -94,13 +94,13 @@ def edge_density(
 
 
 def distance_from_usual(thresholds: FixedThresholds) -> float:
-    """The pull towards the usual threshold, to be added to the density of edges."""
+    """The prior towards the usual threshold, to be added to the edge density."""
     log = math.log(thresholds.negative / USUAL), math.log(thresholds.positive / USUAL)
     return PULL * (log[0] ** 2 + log[1] ** 2) / 2
 
 
 def best_threshold(cost: Cost) -> FixedThresholds:
-    """The common threshold of both signs with the lowest cost."""
+    """The threshold, equal for both signs, with the lowest cost."""
     common = _minimum(lambda log: cost(_both(log)), math.log(LOWEST), math.log(HIGHEST), COARSE)
     return _both(common)
 
@@ -108,7 +108,7 @@ def best_threshold(cost: Cost) -> FixedThresholds:
 def best_thresholds(cost: Cost) -> FixedThresholds:
     """A threshold for each sign: first a common one, then their ratio, then the common one again.
 
-    Only a cost that sees both signs apart can tell; see `disagreement`.
+    Needs a cost that depends on both signs separately, such as `disagreement`.
     """
     common = math.log(best_threshold(cost).positive)
     ratio = _minimum(
@@ -129,9 +129,9 @@ def _both(log: float) -> FixedThresholds:
 def _minimum(
     cost: Callable[[float], float], low: float, high: float, tries: int, *, within: float = 0.02
 ) -> float:
-    """Where `cost` is lowest: the best of evenly spaced tries, then golden section around it.
+    """The minimum of `cost`: the best of evenly spaced tries, then golden section around it.
 
-    The tries keep a rough cost from catching the search in a side valley.
+    The tries keep the search out of local minima of a rough cost.
     """
     step = (high - low) / (tries - 1)
     tried = [low + i * step for i in range(tries)]

@@ -18,7 +18,7 @@ from sharpfield.core.measurements import EventPairs, Instants, Pixels
 from sharpfield.core.protocols import Response
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.core.tone import Curve
-from sharpfield.formation.mixing import mix, mix_of_few
+from sharpfield.formation.mixing import mix, mix_with_few_gradients
 from sharpfield.geometry.rolling import Rolling
 
 
@@ -53,7 +53,7 @@ class ExposureOfViews:
             seen: The frames' pixels, `[m, h, w]`.
             no_grad: Of the further views.
         """
-        mean = mix(light) if no_grad is None else mix_of_few(light, no_grad)
+        mean = mix(light) if no_grad is None else mix_with_few_gradients(light, no_grad)
         return self.tone(self._brightened(mean, seen.frame[:, 0, 0]))
 
     def observe_each(self, light: Radiance, seen: Pixels) -> Float[Tensor, "m h w k c"]:

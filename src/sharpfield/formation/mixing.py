@@ -29,7 +29,7 @@ def mix(
     return outer((weight * inner(radiance.rgb)).sum(-2))
 
 
-def mix_of_few(few: Radiance, rest: Radiance) -> Float[Tensor, "*b c"]:
+def mix_with_few_gradients(few: Radiance, rest: Radiance) -> Float[Tensor, "*b c"]:
     """The mean light of many rays, with the gradient of the mean of a few of them.
 
     Args:

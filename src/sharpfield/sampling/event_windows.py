@@ -15,7 +15,7 @@ from torch import Tensor
 from sharpfield.core.capture import Capture, Split
 from sharpfield.events.counts import counts_between
 from sharpfield.events.index import EventIndex
-from sharpfield.events.latent_frames import SharpInstants
+from sharpfield.events.latent_frames import LatentFrames
 from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import phase_at
 from sharpfield.storage.event_cache import event_index
@@ -33,7 +33,7 @@ class CameraEvents:
     motion: EventMotion
     index: EventIndex | None
     """By pixel; None where positions are rectified or pixels sit behind a colour filter."""
-    latent: SharpInstants | None
+    latent: LatentFrames | None
     """Latent frames by the event double integral; None without training frames of this camera."""
 
 
@@ -55,7 +55,7 @@ def camera_events(capture: Capture, *, latent: bool) -> dict[int, CameraEvents]:
         exact = motion.channel is None and not motion.events.rectified
         index = event_index(motion.events) if exact else None
         frames = _frames_of_track(alone, track) if latent else None
-        images = None if frames is None else SharpInstants(frames, motion, index)
+        images = None if frames is None else LatentFrames(frames, motion, index)
         found[track] = CameraEvents(motion, index, images)
     return found
 

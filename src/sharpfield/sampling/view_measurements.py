@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Depths, EventPairs, Instants, Pixels
-from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
+from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
 from sharpfield.sampling.event_windows import CameraEvents, Times, counts_in_windows
 from sharpfield.sampling.measured_depth import MeasuredDepth
 
@@ -130,7 +130,7 @@ class ViewMeasurements:
         maps = torch.stack([crop.of(torch.from_numpy(measured.at(int(i)))) for i in frames])
         return Depths(maps, torch.full((), instant).expand(maps.shape))
 
-    def _latent_of(self, track: int) -> SharpInstants:
+    def _latent_of(self, track: int) -> LatentFrames:
         assert (found := self.cameras[track].latent) is not None
         return found
 

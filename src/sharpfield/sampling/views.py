@@ -17,7 +17,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import Batch
 from sharpfield.core.seed import number, numpy_generator
-from sharpfield.events.latent_frames import SensorEstimate, SharpInstants
+from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
 from sharpfield.ops.permutation import shuffled
 from sharpfield.sampling.event_windows import Times, camera_events
 from sharpfield.sampling.view_measurements import Crop, Tracks, ViewMeasurements
@@ -112,7 +112,7 @@ class ViewSampler:
             self.cameras = camera_events(capture, latent=options.latent_weight > 0)
         with_frames = [] if frames is None else np.unique(frames.track[capture.split.train])
         both = all(int(track) in self.cameras for track in with_frames)
-        self.latent: dict[int, SharpInstants] = {}
+        self.latent: dict[int, LatentFrames] = {}
         if both:
             self.latent = {t: own.latent for t, own in self.cameras.items() if own.latent}
         self.edi_until = int(options.edi_phase * steps) if self.latent else 0

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from sharpfield.core.events import EventStream
-from sharpfield.events.index import EventIndex, build, count, place
+from sharpfield.events.index import EventIndex, build_index, site_offsets, sort_sites
 from sharpfield.events.sites import find_sites
 from sharpfield.storage.disk_cache import cache_folder, cache_key, cached
 from sharpfield.storage.event_file import EventFile
@@ -59,10 +59,10 @@ def event_index(events: EventStream) -> EventIndex:
     """The per-pixel index of a stream: built in memory, or mapped if the stream is mapped."""
     folder = _folder_of(events)
     if folder is None:
-        return build(events)
+        return build_index(events)
     key = cache_key([folder / "t_us.npy"])
     entry = cached(folder, "index", key, lambda path: write_index(events, path))
-    return build(events) if entry is None else open_index(entry, events.tracks)
+    return build_index(events) if entry is None else open_index(entry, events.tracks)
 
 
 def write_index(events: EventStream, folder: Path, *, at_once: int = SORTED_AT_ONCE) -> None:
@@ -74,17 +74,17 @@ def write_index(events: EventStream, folder: Path, *, at_once: int = SORTED_AT_O
         at_once: Maximum number of events in memory while sorting; a single pixel may have more.
 
     Raises:
-        CaptureError: See `events.index.build`.
+        CaptureError: See `events.index.build_index`.
     """
     site_xy, site_of = find_sites(events)
-    offset = count(events, site_of, len(site_xy))
+    offset = site_offsets(events, site_of, len(site_xy))
     np.save(folder / "site_xy.npy", site_xy)
     np.save(folder / "offset.npy", offset)
     t_us = _created(folder / "t_us.npy", np.dtype(np.int64), len(events))
     p = _created(folder / "p.npy", np.dtype(np.int8), len(events))
     for first, last in site_ranges(offset, at_once):
         part = slice(offset[first], offset[last])
-        t_us[part], p[part] = place(events, site_of, offset, first=first, last=last)
+        t_us[part], p[part] = sort_sites(events, site_of, offset, first=first, last=last)
     t_us.flush()
     p.flush()
 

@@ -16,7 +16,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.events.image import window_image
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.geometry.trajectory import Stamped, Still
 
 WIDTH, HEIGHT, VIEWS, TIMES = 8, 6, 3, 17
@@ -108,7 +108,7 @@ def raw(capture: Capture) -> list[np.ndarray]:
 
 def sums(events: EventStream, track: int, origin_us: int) -> np.ndarray:
     edges = [origin_us + i * SECOND_US // (TIMES - 1) for i in range(TIMES)]
-    index = build(events)
+    index = build_index(events)
     size = {"width": WIDTH, "height": HEIGHT, "track": track}
     counts = [window_image(index, a, b, **size) for a, b in zip(edges, edges[1:], strict=False)]
     return np.stack(counts)[..., 1] - np.stack(counts)[..., 0]

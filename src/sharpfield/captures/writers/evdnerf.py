@@ -23,7 +23,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.events.image import window_image
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.geometry.trajectory import Still
 from sharpfield.storage.arrays import expect_replaceable
 from sharpfield.storage.event_layouts import THRESHOLDS
@@ -107,7 +107,7 @@ def _sums(
     capture: Capture, events: EventStream, tracks: Int64[np.ndarray, "v"]
 ) -> Float32[np.ndarray, "v k h w"]:
     """Signed sums of thresholds in each window of each view."""
-    index, times = build(events), _times_us(capture).tolist()
+    index, times = build_index(events), _times_us(capture).tolist()
     off, on = _thresholds(capture)
     size = {"width": events.width, "height": events.height}
     sums = np.empty((len(tracks), len(times) - 1, events.height, events.width), np.float32)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float32, Float64, Shaped
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import numpy_generator
-from sharpfield.events.index import build
+from sharpfield.events.index import build_index
 from sharpfield.preparation.calibrate.exposure_pairs import exposure_pairs
 from sharpfield.preparation.calibrate.threshold_fit import (
     DEAD_US,
@@ -99,7 +99,7 @@ def calibrate(capture: Capture, options: CalibrateOptions) -> Calibration:
     Raises:
         CaptureError: Frames or events are missing, or nothing moved.
     """
-    index = build(capture.needed_events)
+    index = build_index(capture.needed_events)
     pairs = exposure_pairs(capture, most=options.pairs)
     _, hot = odd_pixels(counts(capture.needed_events))
     every = Equations.of(capture, index, pairs, without=hot)

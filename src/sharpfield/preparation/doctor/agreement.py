@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from sharpfield.core.capture import Capture
-from sharpfield.events.index import EventIndex, build
+from sharpfield.events.index import EventIndex, build_index
 from sharpfield.preparation.calibrate.exposure_pairs import ExposurePair, exposure_pairs, told
 from sharpfield.preparation.doctor.findings import Checkup, Curve
 
@@ -112,7 +112,7 @@ def check_agreement(capture: Capture, checkup: Checkup) -> Agreement | None:
     if len(frames) < 2 or len(np.unique(frames.track)) == len(frames):
         checkup.say("note", "agreement", "single frames cannot be compared with events")
         return None
-    index = build(capture.needed_events)
+    index = build_index(capture.needed_events)
     pairs = exposure_pairs(capture, most=PAIRS)
     seen = np.stack([_luma_change(pair) for pair in pairs])
     usable = np.stack([pair.usable.all(-1) for pair in pairs])

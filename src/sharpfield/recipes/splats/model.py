@@ -23,7 +23,7 @@ from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
-from sharpfield.events.counts import on_frame_clock
+from sharpfield.events.counts import subtract_row_delay
 from sharpfield.fields.gaussians.dynamic import MovingGaussians
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.formation.exposure import EventWindow, ExposureOfViews
@@ -273,7 +273,7 @@ def align_events_to_rolling_shutter(capture: Capture) -> Capture:
     frames, events = capture.frames, capture.events
     if frames is None or events is None:
         return capture
-    return replace(capture, events=on_frame_clock(events, frames.exposure.row_delay_us))
+    return replace(capture, events=subtract_row_delay(events, frames.exposure.row_delay_us))
 
 
 def _motion_unknown(capture: Capture) -> bool:
