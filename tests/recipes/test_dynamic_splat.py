@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from sharpfield.captures.native.layout import write
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.protocols import Growing, Model
@@ -19,13 +20,17 @@ from sharpfield.initialisation.visual_hull import box_cells, moving_cells
 from sharpfield.recipes.splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel
+from sharpfield.rendering.splat import whole
 from sharpfield.rendering.view import ViewRenderer, render_view
+from sharpfield.runs.run import open_run
 from sharpfield.storage.event_cache import event_index
+from sharpfield.storage.splat_file import read_splats
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.options import Options
 from sharpfield.training.session import train
+from tests.cli.command import run
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
 
@@ -163,6 +168,35 @@ def test_the_backdrop_is_what_cameras_see_most_of_the_time():
     own = capture.split.train[frames.track[capture.split.train] == tracks[0]]
     middle = np.median(frames.images[own], 0) / frames.white
     np.testing.assert_allclose(images.light[0] ** (1 / 2.2), middle, atol=1e-4)
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+def test_at_an_instant_the_scene_is_one_of_static_gaussians(sh_degree: int):
+    gaussians = replace(EvDynamicSplat().gaussians, sh_degree=sh_degree, background=0.0)
+    model = replace(small(), gaussians=gaussians).build(tiny_moving(), 0)
+    pose = model.path.pose(torch.tensor(0.4), torch.tensor(0))
+    view = whole(model.capture.camera, pose, 0.4)
+    with torch.no_grad():
+        frozen = model.scene.splatting(model.scene.gaussians_at(0.4), view)
+        torch.testing.assert_close(frozen.rgb, model.draw_views(view).rgb)
+    other = model.scene.gaussians_at(0.7)
+    assert len(other) > len(model.scene.static) and other.sh_degree == sh_degree
+
+
+def test_a_moving_run_is_exported_at_instants(tmp_path: Path):
+    words = ("--preset", "draft", "--steps", 4, "--motion.lifespan-ms", 20, "--device", "cpu")
+    write(tiny_moving(), tmp_path / "spinner")
+    out = tmp_path / "run"
+    assert run("train", "ev-dynamic-splat", tmp_path / "spinner", "--out", out, *words) == 0
+    assert run("export", out, "--out", tmp_path / "one.ply", "--time", 60_000) == 0
+    assert run("export", out, "--out", tmp_path / "all.ply", "--sequence", 3) == 0
+    counts = [len(read_splats(tmp_path / f"{name}.ply").means) for name in ("one", "all_0001")]
+    scene = open_run(out).model.scene
+    assert all(
+        len(scene.static) < count < len(scene.static) + len(scene.moving) for count in counts
+    )
+    assert not (tmp_path / "all_0003.ply").exists()
+    assert run("export", out, "--out", tmp_path / "no.ply", "--time", 10**9) == 2
 
 
 def test_it_is_a_model_that_grows_and_draws_views():

@@ -6,6 +6,7 @@ from typing import Literal
 from tyro.conf import Positional
 
 from sharpfield.cli.arguments import screen
+from sharpfield.core.errors import OptionError
 from sharpfield.runs.run import expect_splat_file, open_run
 
 Encoding = Literal["linear", "gamma2.2", "srgb"]
@@ -15,6 +16,8 @@ def export(
     run: Positional[Path],
     out: Path,
     encoding: Encoding | None = None,
+    time: int | None = None,
+    sequence: int | None = None,
     capture: Path | None = None,
 ) -> None:
     """Write the Gaussians of a run as a file for viewers of splats, in the capture's own world.
@@ -23,8 +26,19 @@ def export(
         run: Folder that `train` made.
         out: The file, FILE.ply.
         encoding: How the colours of the Gaussians relate to light; by default as the frames say.
+        time: Of a moving scene, the instant to export, in us on the capture's clock; by default
+            the middle of the capture.
+        sequence: Export a moving scene at so many instants from the beginning of the capture to its
+            end, as FILE_0000.ply, FILE_0001.ply, and so on.
         capture: Where the capture is, if it moved.
     """
     expect_splat_file(out)  # before a run is opened
-    count = open_run(run, capture=capture, device="cpu").export(out, encoding=encoding)
+    if time is not None and sequence is not None:
+        raise OptionError("an instant or a sequence", got="--time and --sequence", do="give one")
+    opened = open_run(run, capture=capture, device="cpu")
+    if sequence is not None:
+        files = opened.export_sequence(out, sequence, encoding=encoding)
+        screen().print(f"{len(files):,} instants are in {files[0]} to {files[-1].name}")
+        return
+    count = opened.export(out, encoding=encoding, time=time)
     screen().print(f"{count:,} Gaussians are in {out}")

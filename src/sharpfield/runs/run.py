@@ -162,6 +162,7 @@ class Run:
         path: Path | str,
         *,
         encoding: Literal["linear", "gamma2.2", "srgb"] | None = None,
+        time: float | int | None = None,
     ) -> int:
         """Write the Gaussians as a .ply file for viewers of splats, in the capture's world.
 
@@ -169,6 +170,8 @@ class Run:
             path: The file, FILE.ply.
             encoding: How the colours of the Gaussians relate to light; by default as the frames
                 say.
+            time: Of a moving scene, the instant, in us on the capture's clock; by default the
+                middle of the capture. The background is not written.
 
         Returns:
             How many Gaussians there are.
@@ -184,7 +187,16 @@ class Run:
                 got=f"the recipe {self.config.name}",
                 do="export a run of one of the splat recipes; `sharpfield recipes` lists them",
             )
-        gaussians = model.scene.static
+        clock = self.capture.clock
+        unit = 0.5 if time is None else (time - clock.origin_us) / clock.span_us
+        if not 0 <= unit <= 1:
+            raise OptionError(
+                "the time is outside the capture",
+                where=self.folder,
+                got=f"{time} us",
+                do=f"choose one from {clock.origin_us} to {clock.origin_us + clock.span_us} us",
+            )
+        gaussians = model.scene.gaussians_at(unit)
         antialiased = ("antialiased",) if model.scene.splatting.antialiased else ()
         export_splats(
             gaussians,
@@ -194,6 +206,31 @@ class Run:
             comments=(f"sharpfield {self.config.name}", *antialiased),
         )
         return len(gaussians)
+
+    def export_sequence(
+        self,
+        path: Path | str,
+        count: int,
+        *,
+        encoding: Literal["linear", "gamma2.2", "srgb"] | None = None,
+    ) -> list[Path]:
+        """Write a moving scene as numbered .ply files, one for each of some instants.
+
+        Args:
+            path: FILE.ply, for FILE_0000.ply, FILE_0001.ply, and so on.
+            count: How many instants, evenly from the beginning of the capture to its end.
+            encoding: As for `export`.
+
+        Returns:
+            The files.
+        """
+        path, clock = expect_splat_file(Path(path)), self.capture.clock
+        files = []
+        for number in range(count):
+            time = clock.origin_us + clock.span_us * number / max(count - 1, 1)
+            files.append(path.with_name(f"{path.stem}_{number:04d}.ply"))
+            self.export(files[-1], encoding=encoding, time=time)
+        return files
 
     def video(
         self,

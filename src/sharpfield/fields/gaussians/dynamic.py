@@ -79,16 +79,23 @@ class MovingGaussians(Gaussians):
             active=active,
         )
 
-    def frozen_at(self, time: float) -> Gaussians:
-        """Static Gaussians that look as these do at a time."""
+    def frozen_at(self, time: float, *, sh_degree: int = 0) -> Gaussians:
+        """Static Gaussians that look as these do at a time.
+
+        Args:
+            time: 0...1 of the capture.
+            sh_degree: Of the result, whose higher harmonics are zero.
+        """
         with torch.no_grad():
             seen = self.at(time)
+            base = self.harmonics[seen.active]  # [a, 1, c]
+            higher = base.new_zeros(len(base), (sh_degree + 1) ** 2 - 1, base.shape[-1])
             return Gaussians(
                 seen.means,
                 seen.quaternions,
                 seen.scales.log(),
                 seen.opacities.logit(),
-                self.harmonics[seen.active],
+                torch.cat([base, higher], 1),
             )
 
 

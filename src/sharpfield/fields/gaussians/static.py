@@ -131,6 +131,14 @@ class Gaussians(nn.Module):
         learned = self.higher_harmonics[:, : basis.shape[-1]]
         return (light + torch.einsum("vnk,nkc->vnc", basis, learned)).clamp_min(0)
 
+    def joined(self, other: "Gaussians") -> "Gaussians":
+        """These and others of the same SH degree together."""
+        names = ("means", "quaternions", "log_scales", "opacity_logits", "harmonics")
+        rows = [
+            torch.cat([getattr(part, name).detach() for part in (self, other)]) for name in names
+        ]
+        return Gaussians(*rows)
+
     def points(self) -> dict[str, Tensor]:
         """All parameters by name; each has one row for each Gaussian."""
         return dict(self.named_parameters())

@@ -245,6 +245,12 @@ class SplatScene(nn.Module):
             self._screen_grads.append(_ScreenGrad(shift, views.size, active))
         return splatting(cloud, views, shift, drift)
 
+    def gaussians_at(self, time: float) -> Gaussians:
+        """The Gaussians at a time, 0...1 of the capture, as if nothing moved."""
+        if self.moving is None:
+            return self.static
+        return self.static.joined(self.moving.frozen_at(time, sh_degree=self.static.sh_degree))
+
     def penalties(self, step: int) -> Terms:
         """Penalties that free Gaussians of little use, as long as they can be relocated."""
         found = [
