@@ -143,3 +143,18 @@ def test_blosc_is_known_by_its_number(tmp_path, monkeypatch):
     monkeypatch.setattr(h5py.h5z, "filter_avail", lambda code: code != 32001)
     with pytest.raises(MissingExtra, match=r"sharpfield\[io\]"):
         open_events(path)
+
+
+def test_every_dialect_is_read_for_any_layout(tmp_path):
+    path = tmp_path / "events.h5"
+    rows = np.stack([[5, 8, 8], [1, 2, 3], [0, 4, 9], [1, 0, 1]], -1)  # t, x, y, p
+    with h5py.File(path, "w") as file:
+        for camera in ("left", "right"):
+            file[f"davis/{camera}/events"] = np.roll(rows, -1, 1)[:, [0, 1, 3, 2]].astype(float)
+    with pytest.raises(CaptureError, match="several cameras"):
+        open_events(path, size=SIZE)
+    with open_events(path, size=SIZE, camera="right") as file:
+        events = read_events(file)
+    assert events.t_us.tolist() == [5_000_000, 8_000_000, 8_000_000]
+    assert (events.x.tolist(), events.y.tolist()) == ([1, 2, 3], [0, 4, 9])
+    assert events.p.tolist() == [1, -1, 1]

@@ -6,7 +6,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
-from sharpfield.storage import event_layouts, event_writer
+from sharpfield.storage import event_writer, hdf5
 from sharpfield.storage.event_cache import read_events
 from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.event_writer import write_events, writing_events
@@ -97,7 +97,7 @@ def test_no_events(tmp_path, some_events):
 
 
 def test_without_the_plugin_it_is_gzip(tmp_path, some_events, monkeypatch):
-    monkeypatch.setattr(event_layouts.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(hdf5.importlib.util, "find_spec", lambda name: None)
     write_events(tmp_path / "events.h5", some_events(100))
     with h5py.File(tmp_path / "events.h5") as file:
         assert file["events/t"].compression == "gzip" and file["events/t"].shuffle
@@ -109,7 +109,7 @@ def test_with_the_plugin_it_is_blosc(tmp_path, some_events):
         pytest.skip("hdf5plugin is not installed")
     write_events(tmp_path / "events.h5", some_events(100))
     with h5py.File(tmp_path / "events.h5") as file:
-        assert file["events/t"].id.get_create_plist().get_filter(0)[0] == event_layouts.BLOSC
+        assert file["events/t"].id.get_create_plist().get_filter(0)[0] == hdf5.BLOSC
 
 
 def test_a_block_that_fails_leaves_the_old_file(tmp_path, some_events):

@@ -5,7 +5,9 @@ booleans; coordinates as integers of any width or as floats, if rectified. Units
 """
 
 import zipfile
+from typing import Any
 
+import h5py
 import numpy as np
 from jaxtyping import Int8, Int64, Shaped
 
@@ -154,3 +156,30 @@ class ZippedColumn:
         self._file.seek(self._start + first * self._row)
         data = self._file.read(max(last - first, 0) * self._row)
         return np.frombuffer(data, self.dtype).reshape(-1, *self.shape[1:])
+
+
+class TableColumn:
+    """One column of a table, or one field of records, read part by part.
+
+    Args:
+        table: An array on disk: HDF5, zipped, or memory-mapped.
+        column: Index of the column, or name of the field.
+    """
+
+    def __init__(self, table: Any, column: int | str) -> None:
+        self._table, self._column = table, column
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self._table)
+
+    def __getitem__(self, part: slice) -> Stored:
+        """Entries `part.start` to `part.stop`."""
+        if isinstance(self._table, h5py.Dataset):
+            if isinstance(self._column, str):
+                return self._table.fields(self._column)[part]
+            return self._table[part, self._column]
+        rows = self._table[part]
+        return np.array(
+            rows[self._column] if isinstance(self._column, str) else rows[:, self._column]
+        )

@@ -29,7 +29,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
 from sharpfield.storage.event_file import CHUNK
-from sharpfield.storage.event_layouts import compression_plugin
+from sharpfield.storage.hdf5 import compression_plugin
 
 FORMAT, VERSION = "sharpfield-events", 1
 ROWS = 65_536

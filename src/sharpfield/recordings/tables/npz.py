@@ -23,10 +23,8 @@ saccades* (Frontiers in Neuroscience 2015), and the reader its authors publish.
 """
 
 import re
-import zipfile
 from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -46,12 +44,11 @@ from sharpfield.recordings.recording import (
     begins_with,
 )
 from sharpfield.recordings.tables.columns import column_recording
-from sharpfield.storage.event_columns import ZippedColumn, known_unit
+from sharpfield.storage.event_columns import TableColumn, known_unit
 from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
-from sharpfield.storage.event_layouts import UNREADABLE_NPZ, open_events
+from sharpfield.storage.event_layouts import npz_dialect, open_events
 from sharpfield.storage.images import list_images
 
-POSITION = {"position.npy", "timestamp.npy", "polarity.npy"}
 ORDERS = ("xytp", "txyp")
 """Possible orders of the columns of a table."""
 
@@ -59,25 +56,6 @@ NUMBERED = re.compile(r"\d{10}\.npz")
 """File names of vid2e; no other program is known to use them."""
 
 Array = Shaped[np.ndarray, "..."]
-
-
-@dataclass(frozen=True)
-class ArrayColumn:
-    """One column of a table or one field of records, read part by part."""
-
-    rows: Array | ZippedColumn
-    column: int | str
-
-    def __len__(self) -> int:
-        """Number of rows."""
-        return len(self.rows)
-
-    def __getitem__(self, part: slice) -> Array:
-        """Entries `part.start` to `part.stop`."""
-        rows = self.rows[part]
-        if isinstance(self.column, str):
-            return np.array(rows[self.column])
-        return np.array(rows[:, self.column])
 
 
 def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -90,15 +68,11 @@ def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     Raises:
         CaptureError: The file has no events in a known layout, or its unit or size is unknown.
     """
-    unit, size = options.unit, options.size
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = set(archive.namelist())
-    except UNREADABLE_NPZ as error:
-        raise _unreadable(path, error) from None
-    if not names >= POSITION:
-        return column_recording("npz", path, lambda: open_events(path, unit=unit, size=size))
-    return column_recording("Robust e-NeRF npz", path, lambda: _positions(path, unit or "ns", size))
+    return column_recording(
+        npz_dialect(path),
+        path,
+        lambda: open_events(path, unit=options.unit, size=options.size),
+    )
 
 
 def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -160,7 +134,7 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
             path,
             lambda: EventFile(
                 path,
-                {name: ArrayColumn(array, field) for name, field in fields.items()},
+                {name: TableColumn(array, field) for name, field in fields.items()},
                 unit=unit,
                 size=options.size,
             ),
@@ -181,37 +155,11 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         path,
         lambda: EventFile(
             path,
-            {name: ArrayColumn(array, order.index(name)) for name in "xytp"},
+            {name: TableColumn(array, order.index(name)) for name in "xytp"},
             unit=unit,
             size=options.size,
         ),
     )
-
-
-def _positions(path: Path, unit: str, size: tuple[int, int] | None) -> EventFile:
-    with ExitStack() as resources:
-        try:
-            archive = resources.enter_context(zipfile.ZipFile(path))
-            position, again = (ZippedColumn(archive, "position.npy", 2) for _ in range(2))
-            columns = {
-                "x": ArrayColumn(position, 0),
-                "y": ArrayColumn(again, 1),
-                "t": ZippedColumn(archive, "timestamp.npy"),
-                "p": ZippedColumn(archive, "polarity.npy"),
-            }
-        except UNREADABLE_NPZ as error:
-            raise _unreadable(path, error) from None
-        if len({len(column) for column in columns.values()}) != 1 or position.shape[1] != 2:
-            raise CaptureError(
-                "event columns have different lengths",
-                where=path,
-                got=", ".join(f"{name} {len(column)}" for name, column in columns.items()),
-                do="the file may be truncated: copy or convert it again",
-            )
-        return EventFile(
-            path, columns, unit=known_unit(unit), size=size, resources=resources.pop_all()
-        )
-    raise AssertionError("the block above returns or raises")
 
 
 def _mapped(path: Path) -> Array:
@@ -279,12 +227,6 @@ def _is_possible(array: Array, order: str) -> bool:
 def _row_chunks(array: Array) -> Iterator[Array]:
     for first in range(0, len(array), CHUNK):
         yield np.asarray(array[first : first + CHUNK], np.float64)
-
-
-def _unreadable(path: Path, error: Exception) -> CaptureError:
-    return CaptureError(
-        "not a readable npz file", where=path, got=error, do="copy or write it again"
-    )
 
 
 RECORD = 5
