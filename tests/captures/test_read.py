@@ -60,7 +60,7 @@ def test_options_that_do_not_fit(panning, tmp_path):
     native.write(panning, tmp_path)
     with pytest.raises(OptionError, match="unknown layout") as caught:
         read_capture(tmp_path, ReadOptions(layout="nerf"))
-    assert "did you mean d-nerf? There are native, ev-deblur-nerf" in str(caught.value)
+    assert "did you mean d-nerf?" in str(caught.value)
     with pytest.raises(OptionError, match="layout native has no option event_unit") as caught:
         read_capture(tmp_path, ReadOptions(event_unit="ns"))
     assert "it belongs to ev-deblur-nerf" in str(caught.value)
