@@ -23,7 +23,8 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Frames
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
-from sharpfield.evaluation.refine import Refinement, aligned_poses, refine_poses
+from sharpfield.evaluation.options import Refinement
+from sharpfield.evaluation.refine import aligned_poses, refine_poses
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run

@@ -13,7 +13,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from benchmarks.table import Row, save, show
-from sharpfield.preparation.calibrate.measure import CalibrateOptions, calibrate
+from sharpfield.preparation.calibrate.measure import calibrate
+from sharpfield.preparation.options import CalibrateOptions
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate

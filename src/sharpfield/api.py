@@ -13,8 +13,9 @@ from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.preparation.deblurring import DeblurOptions, Deblurred, deblur_to
+from sharpfield.preparation.deblurring import Deblurred, deblur_to
 from sharpfield.preparation.deblurring import deblur as deblur_capture
+from sharpfield.preparation.options import DeblurOptions
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.settings.options import with_options
 from sharpfield.recipes.settings.presets import prepared

@@ -6,12 +6,8 @@ import torch
 
 from sharpfield.core.capture import Clock, Split
 from sharpfield.core.errors import OptionError
-from sharpfield.evaluation.refine import (
-    Refinement,
-    aligned_poses,
-    refine_poses,
-    training_pose_errors,
-)
+from sharpfield.evaluation.options import Refinement
+from sharpfield.evaluation.refine import aligned_poses, refine_poses, training_pose_errors
 from sharpfield.geometry import se3
 from sharpfield.geometry.normalise import moved
 from sharpfield.geometry.space import Similarity

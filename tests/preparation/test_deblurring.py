@@ -14,7 +14,8 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure
 from sharpfield.events.motion import EventMotion
-from sharpfield.preparation.deblurring import DeblurOptions, deblur, deblur_to
+from sharpfield.preparation.deblurring import deblur, deblur_to
+from sharpfield.preparation.options import DeblurOptions
 from sharpfield.preparation.thresholds import find_thresholds
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate

@@ -12,16 +12,16 @@ import torch
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_layouts import OuterPath
 from sharpfield.captures.read import read_capture
-from sharpfield.cli.poses import Elsewhere
-from sharpfield.cli.poses import poses as poses_command
+from sharpfield.cli.poses import Elsewhere, poses_command
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, MissingExtra, OptionError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Still
 from sharpfield.metrics.pose import absolute_error, align
+from sharpfield.preparation.options import PoseOptions
 from sharpfield.preparation.poses import mapping as poses_mapping
 from sharpfield.preparation.poses.external import Mount, attach, known_at
-from sharpfield.preparation.poses.find import PoseOptions, PosesFound, find_poses
+from sharpfield.preparation.poses.find import PosesFound, find_poses
 from sharpfield.preparation.poses.images import sharp_images
 from sharpfield.preparation.poses.path import carried_on
 from sharpfield.preparation.poses.report import as_text, summary

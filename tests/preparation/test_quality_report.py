@@ -7,13 +7,8 @@ from scipy.stats import spearmanr
 
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError
-from sharpfield.preparation.quality import (
-    QualityOptions,
-    as_table,
-    judged,
-    quality_to,
-    rank_correlation,
-)
+from sharpfield.preparation.options import QualityOptions
+from sharpfield.preparation.quality import as_table, judged, quality_to, rank_correlation
 from sharpfield.simulation.room_capture import RoomTiming, simulate_room
 from sharpfield.simulation.static_capture import Rig
 from sharpfield.storage.images import read_image

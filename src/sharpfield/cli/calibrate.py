@@ -5,18 +5,13 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from sharpfield.captures.native import layout as native
-from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
-from sharpfield.core.capture import Thresholds
-from sharpfield.preparation.calibrate.measure import CalibrateOptions
-from sharpfield.preparation.calibrate.measure import calibrate as measure
-from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
+from sharpfield.preparation.options import CalibrateOptions
 
 MEASURING = CalibrateOptions()
 
 
-def calibrate(
+def calibrate_command(
     capture: Positional[Path],
     out: Path,
     write_capture: Path | None = None,
@@ -30,6 +25,12 @@ def calibrate(
         write_capture: Also write the capture, with the thresholds found, to this folder.
         options: How much to look at.
     """
+    from sharpfield.captures.native import layout as native
+    from sharpfield.captures.read import read_capture
+    from sharpfield.core.capture import Thresholds
+    from sharpfield.preparation.calibrate.measure import calibrate as measure
+    from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
+
     held = read_capture(capture, poses=False)
     made = measure(held, options)
     about = write_calibration(held, made, out)

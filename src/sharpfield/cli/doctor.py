@@ -1,20 +1,19 @@
-"""`sharpfield doctor`: a checkup of a capture before hours are spent on it."""
+"""`sharpfield doctor`: check a capture before hours of training."""
 
 import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from tyro.conf import Positional
 
 from sharpfield.cli.arguments import screen
 from sharpfield.core.files import write_json
-from sharpfield.preparation.doctor.checkup import examine_path
-from sharpfield.preparation.doctor.findings import Checkup
-from sharpfield.preparation.doctor.page import verdict, write_doctor_page
-from sharpfield.storage.images import write_image
+
+if TYPE_CHECKING:
+    from sharpfield.preparation.doctor.findings import Checkup
 
 FINDINGS, PAGE = "doctor.json", "doctor.html"
 STYLE = {"error": "bold red", "warning": "yellow", "note": "dim"}
@@ -22,7 +21,7 @@ UNSOUND = 1
 """Exit code when there are errors."""
 
 
-def doctor(
+def doctor_command(
     capture: Positional[Path],
     out: Path | None = None,
     json: bool = False,
@@ -36,8 +35,12 @@ def doctor(
         capture: Folder of the capture, with or without poses.
         out: Folder for `doctor.json`, `doctor.html` and its images.
         json: Print JSON instead of text.
-        layout: Of the capture, if it is not recognised.
+        layout: Layout of the capture, if it is not recognised.
     """
+    from sharpfield.preparation.doctor.checkup import examine_path
+    from sharpfield.preparation.doctor.page import write_doctor_page
+    from sharpfield.storage.images import write_image
+
     checkup, held = examine_path(capture, layout=layout)
     about = as_json(checkup)
     print(_text(about)) if json else _print(checkup)
@@ -52,8 +55,10 @@ def doctor(
         sys.exit(UNSOUND)
 
 
-def as_json(checkup: Checkup) -> dict[str, Any]:
+def as_json(checkup: "Checkup") -> dict[str, Any]:
     """Plain values."""
+    from sharpfield.preparation.doctor.page import verdict
+
     return {
         "capture": checkup.name,
         "verdict": verdict(checkup),
@@ -67,7 +72,9 @@ def _text(about: dict[str, Any]) -> str:
     return json.dumps(about, indent=2)
 
 
-def _print(checkup: Checkup) -> None:
+def _print(checkup: "Checkup") -> None:
+    from sharpfield.preparation.doctor.page import verdict
+
     console = screen()
     for one in checkup.sorted:
         style = STYLE[one.severity]

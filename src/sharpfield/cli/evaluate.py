@@ -5,7 +5,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from sharpfield.cli.arguments import Device, screen
-from sharpfield.evaluation.refine import Refinement
+from sharpfield.evaluation.options import Refinement
 
 REFINEMENT = Refinement()
 

@@ -12,7 +12,7 @@ from sharpfield.runs.run import expect_splat_file, open_run
 Encoding = Literal["linear", "gamma2.2", "srgb"]
 
 
-def export(
+def export_command(
     run: Positional[Path],
     out: Path,
     encoding: Encoding | None = None,

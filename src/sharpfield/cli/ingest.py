@@ -107,7 +107,7 @@ SOURCE, PART = Source(), Part()
 OPTICS, CLEANING, TIMING, SCENE = Optics(), Cleaning(), Timing(), Scene()
 
 
-def ingest(
+def ingest_command(
     recordings: Positional[tuple[Path, ...]],
     out: Path,
     source: Source = SOURCE,

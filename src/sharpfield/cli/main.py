@@ -35,19 +35,33 @@ class Command:
 
 GROUPS: dict[str, dict[str, Command]] = {
     "make data": {
-        "demo": Command("demo:demo", "record a scene, rebuild it by three methods, compare them"),
-        "simulate": Command("captures:simulate", "record a scene with simulated cameras"),
-        "footage": Command("captures:footage", "make blurry frames and events of sharp images"),
+        "demo": Command(
+            "demo:demo_command", "record a scene, rebuild it by three methods, compare them"
+        ),
+        "simulate": Command("simulate:simulate_command", "record a scene with simulated cameras"),
+        "footage": Command(
+            "simulate:footage_command",
+            "make blurry frames and events of sharp images",
+            renamed={"per_second": "fps"},
+        ),
     },
     "prepare": {
-        "ingest": Command("ingest:ingest", "make a capture of what a camera has recorded"),
-        "inspect": Command("captures:inspect", "say what a capture, or a file of events, holds"),
-        "deblur": Command("captures:deblur", "sharpen frames with their events, without training"),
-        "quality": Command("quality:quality", "say which frames of a video are sharp"),
-        "blur": Command("quality:blur", "blur sharp images by random motion kernels"),
-        "doctor": Command("doctor:doctor", "check a capture before training"),
-        "poses": Command("poses:poses", "find camera poses, or attach those of other programs"),
-        "calibrate": Command("calibrate:calibrate", "measure contrast thresholds, find odd pixels"),
+        "ingest": Command("ingest:ingest_command", "make a capture of what a camera has recorded"),
+        "inspect": Command(
+            "inspect:inspect_command", "say what a capture, or a file of events, holds"
+        ),
+        "deblur": Command(
+            "deblur:deblur_command", "sharpen frames with their events, without training"
+        ),
+        "quality": Command("quality:quality_command", "say which frames of a video are sharp"),
+        "blur": Command("quality:blur_command", "blur sharp images by random motion kernels"),
+        "doctor": Command("doctor:doctor_command", "check a capture before training"),
+        "poses": Command(
+            "poses:poses_command", "find camera poses, or attach those of other programs"
+        ),
+        "calibrate": Command(
+            "calibrate:calibrate_command", "measure contrast thresholds, find odd pixels"
+        ),
     },
     "learn": {
         "train": Command("train:train_command", "train a recipe on a capture", recipe=True),
@@ -60,11 +74,15 @@ GROUPS: dict[str, dict[str, Command]] = {
             "render a video or images along a camera path",
             renamed={"images": "frames", "rate": "fps"},
         ),
-        "events": Command("events:events", "render the events a camera would report in a scene"),
-        "export": Command("export:export", "write the Gaussians of a run as a .ply"),
+        "events": Command(
+            "events:events_command", "render the events a camera would report in a scene"
+        ),
+        "export": Command("export:export_command", "write the Gaussians of a run as a .ply"),
     },
     "tools": {
-        "recipes": Command("recipes:recipes", "list recipes, describe one, say how to cite it"),
+        "recipes": Command(
+            "recipes:recipes_command", "list recipes, describe one, say how to cite it"
+        ),
     },
 }
 COMMANDS = {name: one for commands in GROUPS.values() for name, one in commands.items()}

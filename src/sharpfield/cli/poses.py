@@ -3,23 +3,20 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
 from tyro.conf import Positional
 
-from sharpfield.captures.native import layout as native
-from sharpfield.captures.paths.pose_layouts import OuterPath, PathLayout, read_hand_eye, read_path
-from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
-from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.files import write_json
-from sharpfield.preparation.poses.external import Mount, attach, known_at
-from sharpfield.preparation.poses.find import PoseOptions, find_poses
-from sharpfield.preparation.poses.report import as_text, summary, write_poses_page
-from sharpfield.storage.arrays import expect_replaceable
+from sharpfield.preparation.options import PoseOptions
+
+if TYPE_CHECKING:
+    from sharpfield.captures.paths.pose_layouts import OuterPath
+    from sharpfield.core.capture import Capture
+    from sharpfield.preparation.poses.external import Mount
 
 REPORT, PAGE = "poses.json", "poses.html"
 
@@ -32,7 +29,7 @@ class Elsewhere:
     """A file of poses to take instead of finding them."""
     align: Path | None = None
     """A file of poses whose world the poses found are to be brought into."""
-    layout: PathLayout | None = None
+    layout: Literal["tum", "euroc", "kitti", "csv", "npz", "colmap"] | None = None
     """Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap."""
     offset_ms: float = 0.0
     """Added to the times of that file."""
@@ -47,8 +44,10 @@ class Elsewhere:
                 "give either --trajectory or --align", got=f"{self.trajectory} and {self.align}"
             )
 
-    def mount(self) -> Mount:
+    def mount(self) -> "Mount":
         """How the body and the clock of the file relate to the camera's."""
+        from sharpfield.captures.paths.pose_layouts import read_hand_eye
+
         hand = None if self.hand_eye is None else read_hand_eye(self.hand_eye)
         return Mount(round(1000 * self.offset_ms), hand)
 
@@ -56,7 +55,7 @@ class Elsewhere:
 FINDING, ELSEWHERE = PoseOptions(), Elsewhere()
 
 
-def poses(
+def poses_command(
     capture: Positional[Path],
     out: Path,
     options: PoseOptions = FINDING,
@@ -70,6 +69,14 @@ def poses(
         options: Images, lens.
         elsewhere: Poses from a file.
     """
+    from sharpfield.captures.native import layout as native
+    from sharpfield.captures.paths.pose_layouts import read_path
+    from sharpfield.captures.read import read_capture
+    from sharpfield.preparation.poses.external import known_at
+    from sharpfield.preparation.poses.find import find_poses
+    from sharpfield.preparation.poses.report import as_text, summary, write_poses_page
+    from sharpfield.storage.arrays import expect_replaceable
+
     expect_replaceable(out, native.recognise)
     original, mount = read_capture(capture, poses=False), elsewhere.mount()
     if elsewhere.trajectory is not None:
@@ -90,12 +97,17 @@ def poses(
 
 
 def _attach(
-    original: Capture,
-    path: OuterPath,
-    mount: Mount,
+    original: "Capture",
+    path: "OuterPath",
+    mount: "Mount",
     bounds: tuple[float, float] | None,
     out: Path,
 ) -> None:
+    import numpy as np
+
+    from sharpfield.captures.native import layout as native
+    from sharpfield.preparation.poses.external import attach
+
     attached = attach(original, path, mount, bounds=bounds)
     made = attached.capture
     native.write(replace(made, name=out.name), out)

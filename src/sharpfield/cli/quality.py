@@ -3,27 +3,19 @@
 import json as json_format
 from pathlib import Path
 
-from rich.table import Table
 from tyro.conf import Positional
 
 from sharpfield.captures.layout import ReadOptions
-from sharpfield.captures.read import read_capture
 from sharpfield.cli.arguments import screen
-from sharpfield.preparation.quality import (
-    QualityOptions,
-    as_table,
-    blur_images,
-    judged,
-    quality_to,
-)
-from sharpfield.simulation.sensors.motion_blur import INTENSITY, PROBABILITY, SIZE, KernelRange
+from sharpfield.preparation.options import QualityOptions
+from sharpfield.simulation.sensors.motion_blur import INTENSITY, PROBABILITY, SIZE
 
 JUDGING = QualityOptions()
 SHOWN = 12
 """Frames that are printed."""
 
 
-def quality(
+def quality_command(
     capture: Positional[Path],
     json: bool = False,
     out: Path | None = None,
@@ -39,6 +31,11 @@ def quality(
         layout: Of the capture, if it is not recognised.
         options: How frames are judged.
     """
+    from rich.table import Table
+
+    from sharpfield.captures.read import read_capture
+    from sharpfield.preparation.quality import as_table, judged, quality_to
+
     held = read_capture(capture, ReadOptions(layout=layout))
     found, told_by = judged(held, options)
     about = as_table(held, found, told_by)
@@ -63,7 +60,7 @@ def quality(
         console.print(f"The ranking is in {out}")
 
 
-def blur(
+def blur_command(
     images: Positional[Path],
     out: Path,
     k: tuple[int, int] = SIZE,
@@ -81,6 +78,9 @@ def blur(
         probability: Share of images that are blurred.
         seed: Of all kernels.
     """
+    from sharpfield.preparation.quality import blur_images
+    from sharpfield.simulation.sensors.motion_blur import KernelRange
+
     made = blur_images(images, out, ranges=KernelRange(k, phi, probability), seed=seed)
     count = sum(row["blurred"] for row in made)
     screen().print(f"{count} of {len(made)} images were blurred; see {out}")

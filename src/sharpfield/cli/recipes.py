@@ -14,7 +14,7 @@ WIDTH = 96
 COLUMN = 34
 
 
-def recipes(
+def recipes_command(
     what: Positional[Literal["list", "describe", "cite"]] = "list", name: Positional[str] = ""
 ) -> None:
     """List recipes, describe one with its presets and options, or print how to cite it.

@@ -29,6 +29,7 @@ from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
 from sharpfield.core.seed import numpy_generator
+from sharpfield.evaluation.options import Refinement
 from sharpfield.evaluation.views import held_out
 from sharpfield.geometry import se3
 from sharpfield.geometry.rays import cast
@@ -36,7 +37,7 @@ from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics.image import psnr
 from sharpfield.metrics.pose import absolute_error, align, relative_error
 from sharpfield.rendering.splat import whole
-from sharpfield.rendering.view import CHUNK, ViewRenderer, render_view, renderer_of
+from sharpfield.rendering.view import ViewRenderer, render_view, renderer_of
 
 Pose = Float[Tensor, "3 4"]
 
@@ -49,25 +50,6 @@ RMSPROP_SHARE = 0.67
 
 MOVED_SHARE, MOVED_DEG = 1e-4, 0.01
 """Poses count as refined from this change on: of the spread of the cameras, or in degrees."""
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """How poses are refined. Published: 5000 steps; rate 1e-5 for synthetic scenes."""
-
-    steps: int = 500
-    """Steps of gradient descent."""
-    pixels: int = 300
-    """Random pixels of each view and step."""
-    rate: float = 1e-4
-    """Learning rate of the twists, in rad and units of the model's space."""
-    every: int = 100
-    """Steps between full renders, which the best pose of each view is chosen by; 0 takes the pose
-    after the last step."""
-    hard_psnr: float = 19.0
-    """Views with a PSNR below this (dB) sample pixels in proportion to their squared error."""
-    rays: int = CHUNK
-    """Most rays rendered at once."""
 
 
 @dataclass(frozen=True)

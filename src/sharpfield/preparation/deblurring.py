@@ -8,7 +8,6 @@ What deblurring leaves behind: images, a sheet of before and after, numbers.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from jaxtyping import Float, Int64, Shaped, UInt8
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError
 from sharpfield.core.files import write_json
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import luma, tone_of
@@ -25,33 +24,9 @@ from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import edge_density
 from sharpfield.metrics.image import gradient_energy, psnr
+from sharpfield.preparation.options import DeblurOptions
 from sharpfield.preparation.thresholds import Found, find_thresholds, known_thresholds, linear_light
 from sharpfield.storage.images import write_image
-
-Method = Literal["exact", "joint", "published"]
-
-
-@dataclass(frozen=True)
-class DeblurOptions:
-    """How frames are deblurred."""
-
-    threshold: float | Literal["known", "find"] = "known"
-    """Contrast threshold of both signs. `known` takes what the capture's source says and finds
-    thresholds where it is silent; `find` finds them in any case."""
-    method: Method = "exact"
-    """`exact`: in linear light, integrated from event to event. `joint`: the same, then all frames
-    made to agree with the events between them. `published`: as the released Ev-DeblurNeRF does it,
-    on stored values with eight slices."""
-    instants: int = 1
-    """Images per exposure, in the middles of as many equal parts of it. Only for `exact`."""
-
-    def __post_init__(self) -> None:
-        if self.instants < 1 or (self.instants > 1 and self.method != "exact"):
-            raise OptionError(
-                "only the exact method gives several images per exposure",
-                got=f"{self.instants} with method {self.method}",
-                do="use method `exact`, or 1 instant",
-            )
 
 
 @dataclass(frozen=True)

@@ -4,9 +4,8 @@ Blur a folder of sharp images, each by one random motion kernel, and say what wa
 """
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -15,7 +14,8 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.files import replacing, replacing_folder, write_json
 from sharpfield.core.seed import numpy_generator
-from sharpfield.metrics.quality import Means, Quality, Way, event_quality, frame_quality
+from sharpfield.metrics.quality import Quality, event_quality, frame_quality
+from sharpfield.preparation.options import QualityOptions
 from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.storage.images import list_images, read_image, write_image
 
@@ -26,20 +26,6 @@ else:  # matplotlib is imported when a figure is drawn
 
 SHOWN = 5
 """Frames at each end of the ranking that the image shows."""
-
-
-@dataclass(frozen=True)
-class QualityOptions:
-    """How frames are judged."""
-
-    source: Literal["auto", "images", "events"] = "auto"
-    """What tells: auto takes events where the capture has them."""
-    overlap: Means = "auto"
-    """What two images both show: by depth (auto, where there is some) or optical flow."""
-    way: Way = "reconciled"
-    """Compare with several neighbours; or as published, with the next only."""
-    every_frame: bool = False
-    """Judge held-out frames, too."""
 
 
 def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:

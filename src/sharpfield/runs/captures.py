@@ -1,24 +1,25 @@
 """Captures written to disk in the layouts that other programs read."""
 
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from sharpfield.captures.native import layout as native
-from sharpfield.captures.writers import evdnerf, llff_events, scannet
-from sharpfield.core.capture import Capture
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import OptionError, did_you_mean
+
+if TYPE_CHECKING:  # names of layouts are read without importing torch
+    from sharpfield.core.capture import Capture
 
 LayoutName = Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"]
-
-WRITERS = {
-    "native": native.write,
-    "ev-deblur-nerf": llff_events.write,
-    "evdnerf": evdnerf.write,
-    "scannet": scannet.write,
+WRITERS: dict[str, str] = {
+    "native": "native.layout",
+    "ev-deblur-nerf": "writers.llff_events",
+    "evdnerf": "writers.evdnerf",
+    "scannet": "writers.scannet",
 }
+"""Modules in `sharpfield.captures`, each with a function `write`."""
 
 
-def write(capture: Capture, folder: Path | str, layout: str = "native") -> None:
+def write(capture: "Capture", folder: Path | str, layout: str = "native") -> None:
     """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
 
     Args:
@@ -35,6 +36,6 @@ def write(capture: Capture, folder: Path | str, layout: str = "native") -> None:
         raise OptionError(
             "unknown layout to write",
             got=layout,
-            do=f"use one of {', '.join(WRITERS)}",
+            do=did_you_mean(layout, WRITERS),
         )
-    WRITERS[layout](capture, Path(folder))
+    import_module(f"sharpfield.captures.{WRITERS[layout]}").write(capture, Path(folder))

@@ -22,9 +22,7 @@ from sharpfield.twin.event_twin import (
     stated_sensor,
     track_viewpoint,
 )
-
-RECORDED = "recorded"
-"""Name of a sensor with ideal pixels and the thresholds that the capture states."""
+from sharpfield.twin.options import RECORDED
 
 Path = tuple[Sequence[int], Sequence[Any]]
 """Times in us on the capture's clock, and a pose at each."""

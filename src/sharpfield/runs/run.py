@@ -17,8 +17,9 @@ from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.events import EventStream
 from sharpfield.core.progress import progress_on
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
+from sharpfield.evaluation.options import Refinement
 from sharpfield.evaluation.paths import camera_path
-from sharpfield.evaluation.refine import Refinement, refine_poses
+from sharpfield.evaluation.refine import refine_poses
 from sharpfield.evaluation.report import RunDescription, write_report
 from sharpfield.fields.gaussians.export import export_splats
 from sharpfield.metrics.lpips import Lpips
@@ -27,14 +28,15 @@ from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.colormaps import eight_bit
 from sharpfield.report.video import write_video
 from sharpfield.runs.config import RunConfig, device_named, read_run_config, used
-from sharpfield.runs.events import RECORDED, event_sensor, render_events
 from sharpfield.runs.events import Path as EventPath
+from sharpfield.runs.events import event_sensor, render_events
 from sharpfield.runs.events import viewpoint as event_viewpoint
 from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.record import Ledger, read_ledger
 from sharpfield.twin.event_twin import TIME_STEPS, TimeSteps
+from sharpfield.twin.options import RECORDED
 
 
 @dataclass(frozen=True, repr=False)

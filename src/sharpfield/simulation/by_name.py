@@ -4,21 +4,16 @@ Each group of options has a default for every field, and ignores what a kind of 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, did_you_mean
-from sharpfield.simulation.cameras.motions import MOTIONS
-from sharpfield.simulation.cameras.rigs import Views, hand_held, ring
-from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
-from sharpfield.simulation.room_capture import ROOM_RIG, RoomSensors, RoomTiming, simulate_room
-from sharpfield.simulation.scenes.moving import MOVING_SCENES
-from sharpfield.simulation.scenes.static import SCENES
-from sharpfield.simulation.sensors.depth import DepthSensor
-from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
-from sharpfield.simulation.sensors.frames import FrameSensor
-from sharpfield.simulation.static_capture import Rig, Timing
-from sharpfield.simulation.static_capture import simulate as simulate_still
+
+if TYPE_CHECKING:  # options are read without importing torch
+    from sharpfield.core.capture import Capture
+    from sharpfield.simulation.cameras.rigs import Views
+    from sharpfield.simulation.room_capture import RoomSensors, RoomTiming
+    from sharpfield.simulation.sensors.event_pixels import EventSensor
+    from sharpfield.simulation.static_capture import Rig, Timing
 
 ROOM = "room"
 STILL_SIZE, MOVING_SIZE, ROOM_SIZE = (240, 160), (64, 64), (240, 180)
@@ -44,12 +39,17 @@ class RoomOptions:
     """Metres by which poses stray slowly from the true ones."""
 
     @property
-    def sensors(self) -> RoomSensors:
+    def sensors(self) -> "RoomSensors":
         """How well depth and poses are known."""
+        from sharpfield.simulation.room_capture import RoomSensors
+        from sharpfield.simulation.sensors.depth import DepthSensor
+
         return RoomSensors(DepthSensor(self.depth_noise), self.drift)
 
-    def timing(self, timed: "TimingOptions", layout: str) -> RoomTiming:
+    def timing(self, timed: "TimingOptions", layout: str) -> "RoomTiming":
         """When frames are taken; a layout that fixes what is held out has its own split."""
+        from sharpfield.simulation.room_capture import RoomTiming
+
         given = {k: v for k, v in vars(timed).items() if v is not None}
         if "most_change" in given:
             raise OptionError("a walk has even steps", got="most_change", do="give step_us")
@@ -85,8 +85,10 @@ class RecordingOptions:
     """Its coefficients, as OpenCV's: k1 k2 p1 p2 k3 of brown, k1 k2 k3 k4 of fisheye."""
     walk: RoomOptions = ROOM_OPTIONS
 
-    def sensors(self, base: Rig, size: tuple[int, int]) -> Rig:
+    def sensors(self, base: "Rig", size: tuple[int, int]) -> "Rig":
         """The two sensors behind the lens of a rig."""
+        from sharpfield.simulation.sensors.frames import FrameSensor
+
         events, frames = sensor_named(self.sensor), FrameSensor()
         if self.threshold is not None:
             events = replace(events, threshold_on=self.threshold, threshold_off=self.threshold)
@@ -114,8 +116,10 @@ class RigOptions:
     held_out: int = 4
     """Further cameras, whose frames and events are for testing."""
 
-    def cameras(self, recording: RecordingOptions, seed: int) -> Views:
+    def cameras(self, recording: RecordingOptions, seed: int) -> "Views":
         """Where they are."""
+        from sharpfield.simulation.cameras.rigs import hand_held, ring
+
         if self.rig == "hand":
             return hand_held(recording.motion, seed=seed, held_out=self.held_out)
         return ring(self.views, held_out=min(self.held_out, self.views))
@@ -139,7 +143,7 @@ class TimingOptions:
     test_every: int | None = None
     """Every how many frames one is held out: 8; of a moving scene, of the held-out cameras."""
 
-    def over(self, base: Timing) -> Timing:
+    def over(self, base: "Timing") -> "Timing":
         """A timing with what was given in place of its own."""
         return replace(base, **{k: v for k, v in vars(self).items() if v is not None})
 
@@ -156,7 +160,7 @@ def simulate_named(
     rig: RigOptions = RIG,
     timing: TimingOptions = TIMING,
     seed: int = 0,
-) -> Capture:
+) -> "Capture":
     """Record a closed-form scene with simulated cameras: frames, events, poses, sharp truth.
 
     Args:
@@ -171,6 +175,14 @@ def simulate_named(
     Raises:
         OptionError: A name is unknown, or an option does not fit the scene.
     """
+    from sharpfield.simulation.cameras.motions import MOTIONS
+    from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
+    from sharpfield.simulation.room_capture import ROOM_RIG, simulate_room
+    from sharpfield.simulation.scenes.moving import MOVING_SCENES
+    from sharpfield.simulation.scenes.static import SCENES
+    from sharpfield.simulation.static_capture import Rig, Timing
+    from sharpfield.simulation.static_capture import simulate as simulate_still
+
     _expect_known("scene", scene, [*SCENES, *MOVING_SCENES, ROOM])
     _expect_known("motion", recording.motion, MOTIONS)
     whole = isinstance(size, tuple | list) and all(isinstance(side, int) for side in size)
@@ -199,12 +211,14 @@ def simulate_named(
     return simulate_still(scene, recording.motion, rig=sensors, timing=timed, seed=seed)
 
 
-def sensor_named(name: str) -> EventSensor:
+def sensor_named(name: str) -> "EventSensor":
     """An event sensor by its name.
 
     Raises:
         OptionError: There is none of this name.
     """
+    from sharpfield.simulation.sensors.event_pixels import SENSORS
+
     _expect_known("sensor", name, SENSORS)
     return SENSORS[name]
 

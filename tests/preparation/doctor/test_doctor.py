@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.native import layout as native
-from sharpfield.cli.doctor import doctor
+from sharpfield.cli.doctor import doctor_command
 from sharpfield.core.capture import Capture, Known, Split
 from sharpfield.core.frames import Exposure
 from sharpfield.geometry.trajectory import Stamped
@@ -188,7 +188,7 @@ def test_command_writes_a_page_and_fails_on_errors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     native.write(sound(), tmp_path / "fine")
-    doctor(tmp_path / "fine", tmp_path / "out", json=True)
+    doctor_command(tmp_path / "fine", tmp_path / "out", json=True)
     said = json.loads(capsys.readouterr().out)
     assert said["counts"]["error"] == 0
     assert json.loads((tmp_path / "out" / "doctor.json").read_text()) == said
@@ -196,6 +196,6 @@ def test_command_writes_a_page_and_fails_on_errors(
     assert "ready for training" in page and "http://" not in page.replace("http://www.w3", "")
     shutil.rmtree(tmp_path / "fine" / "frames")
     with pytest.raises(SystemExit) as stopped:
-        doctor(tmp_path / "fine")
+        doctor_command(tmp_path / "fine")
     assert stopped.value.code == 1
     assert "error" in capsys.readouterr().out

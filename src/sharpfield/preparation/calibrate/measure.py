@@ -28,6 +28,7 @@ from sharpfield.preparation.calibrate.threshold_fit import (
     with_events_around,
 )
 from sharpfield.preparation.doctor.events import counts, odd_pixels
+from sharpfield.preparation.options import CalibrateOptions
 
 ROUNDS = 8
 """Gauss-Newton steps."""
@@ -46,16 +47,6 @@ ENOUGH = 4.0
 SURE = 5.0
 OFF_BY = 0.35
 """A deviating pixel is off by so many standard deviations, and by this share of the threshold."""
-
-
-@dataclass(frozen=True)
-class CalibrateOptions:
-    """How thresholds are measured."""
-
-    pairs: int = 12
-    """Pairs of exposures looked at, spread over the capture."""
-    seed: int = 0
-    """Of the bootstrap."""
 
 
 @dataclass(frozen=True)

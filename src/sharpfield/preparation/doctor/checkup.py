@@ -13,12 +13,13 @@ from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError
-from sharpfield.preparation.calibrate.measure import CalibrateOptions, calibrate
+from sharpfield.preparation.calibrate.measure import calibrate
 from sharpfield.preparation.doctor.agreement import check_agreement
 from sharpfield.preparation.doctor.events import check_layout, check_light, check_pixels, check_rate
 from sharpfield.preparation.doctor.findings import Checkup
 from sharpfield.preparation.doctor.poses import check_blur, check_images, check_motion
 from sharpfield.preparation.doctor.times import check_hold_out, check_poses_known, check_units
+from sharpfield.preparation.options import CalibrateOptions
 from sharpfield.preparation.thresholds import known_thresholds
 
 PAIRS = 4

@@ -18,13 +18,13 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 from sharpfield.geometry.space import Similarity
 from sharpfield.geometry.trajectory import Stamped, Still, Tracks
+from sharpfield.preparation.options import PoseOptions
 from sharpfield.preparation.poses.find_checks import Relief, relief
 from sharpfield.preparation.poses.images import Sharp, Source, sharp_images
 from sharpfield.preparation.poses.mapping import (
     LEAST_FEATURES,
     LEAST_MATCHES,
     Intrinsics,
-    Lens,
     LensTask,
     Map,
     Seen,
@@ -52,25 +52,6 @@ BOUNDS_MARGIN = 1.1
 
 KnownAt = Callable[[Int64[np.ndarray, "n"]], Known]
 """Gives the poses that something else says for some times of the capture, in us."""
-
-
-@dataclass(frozen=True)
-class PoseOptions:
-    """How poses are found."""
-
-    images: Source = "auto"
-    """`edi`: frames deblurred with their events. `frames`: as they are. `sharpest`: only the
-    sharpest of each three neighbours. `auto`: `edi` where there are events and exposures."""
-    instants: int | None = None
-    """Images taken from each exposure, with `edi`; more make the path finer, and take longer.
-    By default three, or fewer where that would be more than 120 images."""
-    intrinsics: Intrinsics | None = None
-    """`given` keeps the camera, `refine` starts from its focal length, `find` knows nothing; by
-    default `given`, or `find` where the capture does not know its focal length."""
-    lens: Lens = "pinhole"
-    """What to look for, with `find`."""
-    seed: int = 0
-    """Of what is drawn by chance."""
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ from jaxtyping import Float, Int64, UInt8
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.metrics.image import gradient_energy
-from sharpfield.preparation.deblurring import DeblurOptions, deblur
+from sharpfield.preparation.deblurring import deblur
+from sharpfield.preparation.options import DeblurOptions, Source
 from sharpfield.preparation.thresholds import Found
-
-Source = Literal["auto", "edi", "frames", "sharpest"]
 
 NEIGHBOURHOOD = 3
 """The sharpest of so many consecutive frames stands for them."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
@@ -23,10 +23,8 @@ from sharpfield.captures.layouts.colmap_model import camera_of
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError, need
 from sharpfield.core.lenses import LENSES
+from sharpfield.preparation.options import Intrinsics, Lens
 from sharpfield.storage.images import write_image
-
-Intrinsics = Literal["given", "refine", "find"]
-Lens = Literal["pinhole", "radial", "brown", "fisheye"]
 
 FOUND_MODELS = {
     "pinhole": "SIMPLE_PINHOLE",
