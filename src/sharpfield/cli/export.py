@@ -1,4 +1,4 @@
-"""The command that gives a scene of Gaussians to other programs."""
+"""`sharpfield export`: the Gaussians of a run as a file for splat viewers."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,7 +7,6 @@ from tyro.conf import Positional
 
 from sharpfield.cli.arguments import screen
 from sharpfield.core.errors import OptionError
-from sharpfield.runs.run import expect_splat_file, open_run
 
 Encoding = Literal["linear", "gamma2.2", "srgb"]
 
@@ -23,15 +22,17 @@ def export_command(
     """Write the Gaussians of a run as a file for viewers of splats, in the capture's own world.
 
     Args:
-        run: Folder that `train` made.
-        out: The file, FILE.ply.
-        encoding: How the colours of the Gaussians relate to light; by default as the frames say.
+        run: Folder of the run.
+        out: File to write, FILE.ply.
+        encoding: Encoding of the colours of the Gaussians; by default that of the frames.
         time: Of a moving scene, the instant to export, in us on the capture's clock; by default
             the middle of the capture.
-        sequence: Export a moving scene at so many instants from the beginning of the capture to its
-            end, as FILE_0000.ply, FILE_0001.ply, and so on.
-        capture: Where the capture is, if it moved.
+        sequence: Export a moving scene at this many instants from the beginning of the capture to
+            its end, as FILE_0000.ply, FILE_0001.ply, and so on.
+        capture: Folder of the capture, if it moved.
     """
+    from sharpfield.runs.run import expect_splat_file, open_run
+
     expect_splat_file(out)  # before a run is opened
     if time is not None and sequence is not None:
         raise OptionError("an instant or a sequence", got="--time and --sequence", do="give one")
