@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sharpfield.captures.blocks import blocks_of, limited, parsed
+from sharpfield.captures.blocks import blocks_of, parse_block, restrict_to_block
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError, OptionError
@@ -44,15 +44,15 @@ def corridor(*, depth: bool = True) -> Capture:
 def test_slabs_part_space_across_its_longest_direction(depth: bool):
     blocks = blocks_of(corridor(depth=depth), 3)
     points = np.random.default_rng(0).normal(0, 30, (1000, 3))
-    assert (np.sum([block.holds(points) for block in blocks], axis=0) == 1).all()
+    assert (np.sum([block.contains(points) for block in blocks], axis=0) == 1).all()
     for block in blocks:
-        assert abs(block.across[0]) > 0.99
+        assert abs(block.normal[0]) > 0.99
     assert np.diff([block.low for block in blocks]).min() > 0
 
 
 def test_each_block_learns_from_the_frames_that_see_it_and_neighbours_share_some():
     capture = corridor()
-    left, right = (limited(capture, block).split for block in blocks_of(capture, 2))
+    left, right = (restrict_to_block(capture, block).split for block in blocks_of(capture, 2))
     train = set(capture.split.train.tolist())
     assert set(left.train.tolist()) | set(right.train.tolist()) == train
     shared = set(left.train.tolist()) & set(right.train.tolist())
@@ -63,25 +63,25 @@ def test_each_block_learns_from_the_frames_that_see_it_and_neighbours_share_some
 
 def test_nothing_else_changes():
     capture = corridor()
-    part = limited(capture, blocks_of(capture, 2)[0])
+    part = restrict_to_block(capture, blocks_of(capture, 2)[0])
     assert part.frames is capture.frames and part.trajectory is capture.trajectory
 
 
 def test_one_block_is_everything():
     capture = corridor()
     (block,) = blocks_of(capture, 1)
-    assert np.array_equal(limited(capture, block).split.train, capture.split.train)
+    assert np.array_equal(restrict_to_block(capture, block).split.train, capture.split.train)
 
 
 def test_a_block_that_nobody_sees_is_an_error():
     capture = corridor()
     block = replace(blocks_of(capture, 2)[0], low=100.0, high=110.0)
     with pytest.raises(CaptureError, match="no training frame sees this block"):
-        limited(capture, block)
+        restrict_to_block(capture, block)
 
 
 @pytest.mark.parametrize("text", ["", "2", "0/2", "3/2", "a/b", "1/", "-1/2"])
 def test_what_is_no_block_is_said(text: str):
-    assert parsed("2/4") == (1, 4)
+    assert parse_block("2/4") == (1, 4)
     with pytest.raises(OptionError, match="not a block"):
-        parsed(text)
+        parse_block(text)

@@ -27,6 +27,6 @@ def test_a_rule_that_cannot_be_read(rule):
 
 
 def test_something_must_be_left():
-    with pytest.raises(CaptureError, match="no frame is left") as caught:
+    with pytest.raises(CaptureError, match="no training frame is left") as caught:
         split_by_rule(4, "last:5")
     assert "4 frames" in str(caught.value)

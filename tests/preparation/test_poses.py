@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.paths.pose_layouts import OuterPath
+from sharpfield.captures.paths.pose_layouts import ExternalPath
 from sharpfield.captures.read import read_capture
 from sharpfield.cli.poses import Elsewhere, poses_command
 from sharpfield.core.capture import Capture
@@ -111,7 +111,7 @@ def test_known_positions_give_the_world() -> None:
     pytest.importorskip("pycolmap")
     path = fast().trajectory
     assert isinstance(path, Stamped)
-    outer = OuterPath("tum", path.poses, path.times_us - 5000)
+    outer = ExternalPath("tum", path.poses, path.times_us - 5000)
     known = partial(known_at, outer, Mount(offset_us=5000))
     made = find_poses(unposed(fast()), PoseOptions(instants=1), known=known)
     middle = fast().needed_frames.exposure.middle_us
@@ -143,7 +143,7 @@ def test_poses_of_a_file_follow_clock_and_hand() -> None:
     body = se3.compose(
         torch.from_numpy(path.poses), se3.inverse(hand).expand(len(path.poses), 3, 4)
     ).numpy()
-    outer = OuterPath("euroc", body, path.times_us + 7_000_000)
+    outer = ExternalPath("euroc", body, path.times_us + 7_000_000)
     mount = Mount(offset_us=-7_000_000, body_from_camera=hand.numpy())
     made = attach(unposed(fast()), outer, mount, bounds=(2.0, 8.0))
     np.testing.assert_allclose(made.capture.trajectory.poses, path.poses, atol=1e-12)
@@ -154,7 +154,7 @@ def test_frames_and_events_beyond_a_file_are_left_out() -> None:
     path = fast().trajectory
     assert isinstance(path, Stamped)
     half = len(path.times_us) // 2
-    outer = OuterPath("tum", path.poses[:half], path.times_us[:half])
+    outer = ExternalPath("tum", path.poses[:half], path.times_us[:half])
     made = attach(unposed(fast()), outer, Mount(), bounds=(2.0, 8.0))
     assert 0 < len(made.kept) < 7
     events = made.capture.needed_events
@@ -164,14 +164,14 @@ def test_frames_and_events_beyond_a_file_are_left_out() -> None:
 def test_bounds_are_found_from_frames_where_nobody_knows_them() -> None:
     path = fast().trajectory
     assert isinstance(path, Stamped)
-    made = attach(unposed(fast()), OuterPath("tum", path.poses, path.times_us), Mount()).capture
+    made = attach(unposed(fast()), ExternalPath("tum", path.poses, path.times_us), Mount()).capture
     assert fast().near / 2.5 < made.near < fast().near * 2 < made.far < fast().far * 2.5
 
 
 def test_a_wrong_clock_is_named_with_the_offset_that_mends_it() -> None:
     path = fast().trajectory
     assert isinstance(path, Stamped)
-    late = OuterPath("tum", path.poses, path.times_us + 60_000_000)
+    late = ExternalPath("tum", path.poses, path.times_us + 60_000_000)
     with pytest.raises(CaptureError, match="not taken at the same time") as caught:
         attach(unposed(fast()), late, Mount(), bounds=(2.0, 8.0))
     assert "--offset-ms -59990" in caught.value.do
@@ -181,7 +181,7 @@ def test_poses_without_times_must_be_as_many_as_the_frames() -> None:
     path = fast().trajectory
     assert isinstance(path, Stamped)
     with pytest.raises(CaptureError, match="as many as the frames"):
-        attach(unposed(fast()), OuterPath("kitti", path.poses), Mount(), bounds=(2.0, 8.0))
+        attach(unposed(fast()), ExternalPath("kitti", path.poses), Mount(), bounds=(2.0, 8.0))
 
 
 def test_a_path_is_carried_on_at_its_speed_and_not_too_far() -> None:

@@ -1,9 +1,9 @@
-"""A long capture in blocks, each learned on its own: here, or by as many machines as there are.
+"""Split a long capture into blocks that are trained separately, on one or several computers.
 
-Space is cut into slabs, across the direction in which the capture is longest, so that each is seen
-by about as many pixels. A block learns from the training frames that see enough of its slab, or of
-what lies close to it: blocks overlap. Nothing else about the capture changes, so that models of
-all blocks live in the same world, and each keeps what lies in its own slab when they are merged.
+Space is cut into slabs perpendicular to the principal axis of the visible scene, so that each slab
+is seen by about the same number of pixels. A block is trained on the training frames that see
+enough of its slab or of its margins: blocks overlap. Nothing else about the capture changes, so the
+models of all blocks share one world, and merging keeps of each model what lies in its own slab.
 
 Source: block-wise training as in Block-NeRF (CVPR 2022) and VastGaussian (CVPR 2024).
 """
@@ -18,38 +18,39 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 
 PROBES = 8
-"""Pixels that are asked for what a frame sees, along each axis of the image."""
+"""Pixels along each image axis whose depth stands for what a frame sees."""
 
 SHARE = 0.1
-"""Part of what a frame sees that has to be in a block's slab for the block to learn from it."""
+"""Minimum share of what a frame sees that must lie in a slab for its block to use the frame."""
 
 OVERLAP = 0.15
-"""How far a slab reaches into its neighbours when frames are chosen, relative to its own width."""
+"""Margin of a slab on both sides when frames are chosen, relative to its width."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """A slab of space: what lies between two parallel planes, in the world of the capture."""
+    """A slab of space between two parallel planes, in world coordinates of the capture."""
 
     index: int
     count: int
-    across: Float64[np.ndarray, "3"]
-    """Unit vector from plane to plane."""
+    normal: Float64[np.ndarray, "3"]
+    """Unit normal of both planes."""
     low: float
-    """Where the slab begins along it; -inf for the first."""
+    """Position of the first plane along the normal; -inf for the first slab."""
     high: float
+    """Position of the second plane; inf for the last slab."""
 
-    def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Which points lie in the slab: each point lies in exactly one."""
-        along = points @ self.across
+    def contains(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Which points lie in the slab: each point lies in exactly one slab."""
+        along = points @ self.normal
         return (along >= self.low) & (along < self.high)
 
 
-def parsed(text: str) -> tuple[int, int]:
-    """Number and count of a block, from "2/4": the second of four.
+def parse_block(text: str) -> tuple[int, int]:
+    """Index (from 0) and number of blocks, from "2/4": the second of four.
 
     Raises:
-        OptionError: It is not of this form.
+        OptionError: The text is not of this form.
     """
     first, _, second = text.partition("/")
     if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second)):
@@ -58,32 +59,32 @@ def parsed(text: str) -> tuple[int, int]:
 
 
 def blocks_of(capture: Capture, count: int) -> list[Block]:
-    """The slabs of a capture, in order.
+    """The blocks of a capture, in the order of their slabs.
 
     Args:
         capture: With frames.
-        count: How many.
+        count: Number of blocks.
     """
     seen = _seen(capture).reshape(-1, 3)
     middle = seen.mean(0)
-    across = np.linalg.svd(seen - middle, full_matrices=False)[2][0]
-    across = across * np.sign(across[np.argmax(np.abs(across))])
-    cuts = np.quantile(seen @ across, np.arange(1, count) / count)
+    normal = np.linalg.svd(seen - middle, full_matrices=False)[2][0]  # first principal axis
+    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
+    cuts = np.quantile(seen @ normal, np.arange(1, count) / count)
     ends = [-np.inf, *cuts.tolist(), np.inf]
-    return [Block(i, count, across, ends[i], ends[i + 1]) for i in range(count)]
+    return [Block(i, count, normal, ends[i], ends[i + 1]) for i in range(count)]
 
 
-def limited(capture: Capture, block: Block) -> Capture:
-    """The capture with those frames alone in its split that see enough of a block.
+def restrict_to_block(capture: Capture, block: Block) -> Capture:
+    """The capture with only those frames in its split that see enough of a block.
 
     Raises:
-        CaptureError: No training frame does.
+        CaptureError: No training frame sees enough of it.
     """
     frames = np.concatenate([capture.split.train, capture.split.test])
-    along = _seen(capture) @ block.across
+    along = _seen(capture) @ block.normal  # [m, q]
     width = min(np.ptp(along), block.high - block.low)
-    reach = OVERLAP * width
-    near = (along >= block.low - reach) & (along < block.high + reach)
+    margin = OVERLAP * width
+    near = (along >= block.low - margin) & (along < block.high + margin)
     kept = frames[near.mean(1) >= SHARE]
     train = capture.split.train[np.isin(capture.split.train, kept)]
     if not len(train):
@@ -97,25 +98,25 @@ def limited(capture: Capture, block: Block) -> Capture:
 
 
 def _seen(capture: Capture) -> Float64[np.ndarray, "m q 3"]:
-    """Points that the frames of the split see, training frames first; unknown ones repeat."""
+    """World points at probe pixels of the frames of the split, training frames first."""
     chosen = np.concatenate([capture.split.train, capture.split.test])
     poses = capture.frame_pose(chosen).detach().double().numpy()
     rays, depth = _probed(capture, chosen)
     local = depth[..., None] * rays
-    return local @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]
+    return local @ poses[:, :, :3].swapaxes(1, 2) + poses[:, None, :, 3]  # [m, q, 3]
 
 
 def _probed(
     capture: Capture, chosen: np.ndarray
 ) -> tuple[Float64[np.ndarray, "q 3"], Float64[np.ndarray, "m q"]]:
-    """Some directions in camera axes, with a z of 1, and the depth of each in each frame.
+    """Directions of probe pixels in camera axes, scaled to z = 1, and their depth in each frame.
 
-    It is that of the depth camera, if there is one; else half way, in inverse depth, between the
-    capture's nearest and farthest.
+    Depths come from the depth camera if there is one, with the median where unknown; else they are
+    the harmonic mean of near and far.
     """
     camera = capture.camera if capture.depth is None else capture.depth.camera
-    place = (np.arange(PROBES) + 0.5) / PROBES
-    xy = np.stack(np.meshgrid(place * camera.width, place * camera.height), -1).reshape(-1, 2)
+    share = (np.arange(PROBES) + 0.5) / PROBES
+    xy = np.stack(np.meshgrid(share * camera.width, share * camera.height), -1).reshape(-1, 2)
     rays = camera.direction(torch.from_numpy(xy)).numpy()
     rays = rays / rays[:, 2:]
     usual = 2 / (1 / capture.near + 1 / capture.far)

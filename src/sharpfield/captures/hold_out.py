@@ -1,4 +1,4 @@
-"""Rules by which published data sets hold out frames for testing.
+"""Rules by which published data sets hold out test frames.
 
 A rule is written `every:8` (frames 0, 8, 16, ...), `train:5` (all but frames 0, 5, 10, ...),
 `last:5` or `none`.
@@ -15,16 +15,16 @@ RULE = re.compile(r"(?P<kind>every|train|last):(?P<number>[1-9][0-9]*)|none")
 
 
 def split_by_rule(count: int, rule: str) -> Split:
-    """Which of `count` frames are learned from, and which are held out.
+    """The training frames and the held-out frames among `count` frames.
 
     Raises:
-        OptionError: The rule cannot be read.
-        CaptureError: It leaves nothing to learn from.
+        OptionError: The rule is malformed.
+        CaptureError: It leaves no training frames.
     """
     match = RULE.fullmatch(rule)
     if match is None:
         raise OptionError(
-            "unknown rule of what to hold out",
+            "unknown hold-out rule",
             got=rule,
             do="write every:8, train:5, last:5 or none",
         )
@@ -38,6 +38,8 @@ def split_by_rule(count: int, rule: str) -> Split:
         held_out = every >= count - number
     if held_out.all():
         raise CaptureError(
-            "no frame is left to learn from", got=f"{count} frames, hold-out rule {rule}"
+            "no training frame is left",
+            got=f"{count} frames, hold-out rule {rule}",
+            do="hold out fewer frames",
         )
     return Split(train=every[~held_out], test=every[held_out])

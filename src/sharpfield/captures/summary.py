@@ -1,7 +1,7 @@
-"""What a capture or a file of events holds, in numbers; plain values, ready for JSON.
+"""Summary of a capture or of a file of events, as plain values ready for JSON.
 
-A file is gone through a chunk at a time, so it need not fit in memory. Where a file does not say
-the unit of its times, times in us and rates are None and the stored ones are given instead.
+A file is read a chunk at a time, so it need not fit in memory. Where a file does not state the unit
+of its times, times in us and rates are None and the first and last stored times are given instead.
 """
 
 from dataclasses import replace
@@ -24,16 +24,16 @@ from sharpfield.storage.event_file import CHUNK, EventFile
 from sharpfield.storage.event_layouts import open_events
 
 DEPTH_SAMPLES = 16
-"""Depth maps that are looked into."""
+"""Depth maps from which the share of known pixels and the median are computed."""
 
 PATH_SAMPLES = 1000
-"""Instants at which the length of a trajectory is measured."""
+"""Number of poses from which the length of a trajectory is computed."""
 
 EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
 
 
 def summary(path: Path | str, options: ReadOptions = NO_OPTIONS) -> dict[str, Any]:
-    """What is at a path: a capture's folder, or a single file of events.
+    """Summary of a capture's folder, or of a single file of events.
 
     Args:
         path: The folder or file.
@@ -45,14 +45,14 @@ def summary(path: Path | str, options: ReadOptions = NO_OPTIONS) -> dict[str, An
     path = Path(path)
     if path.is_file() and path.suffix in EVENT_SUFFIXES:
         with open_events(path, unit=options.event_unit) as file:
-            told = file if file.unit else replace(file, unit=_unit_of_layout(path))
-            return {"kind": "events", "name": path.name, "events": file_summary(told)}
+            known = file if file.unit else replace(file, unit=_unit_of_layout(path))
+            return {"kind": "events", "name": path.name, "events": file_summary(known)}
     capture = read_capture(path, options, poses=False)
     return capture_summary(capture)
 
 
 def capture_summary(capture: Capture) -> dict[str, Any]:
-    """What a capture holds."""
+    """Summary of a capture."""
     about: dict[str, Any] = {"kind": "capture", "name": capture.name, "layout": capture.source}
     if capture.events is not None:
         about["events"] = stream_summary(capture.events)
@@ -90,13 +90,13 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
 
 
 def stream_summary(events: EventStream) -> dict[str, Any]:
-    """What a stream of events holds."""
-    brighter = sum(
+    """Summary of a stream of events."""
+    positive = sum(
         int((events.p[first : first + CHUNK] > 0).sum()) for first in range(0, len(events), CHUNK)
     )
     span = (int(events.t_us[0]), int(events.t_us[-1])) if len(events) else None
     return {
-        **_counts(len(events), brighter, span),
+        **_counts(len(events), positive, span),
         "width": events.width,
         "height": events.height,
         "rectified": events.rectified,
@@ -106,7 +106,7 @@ def stream_summary(events: EventStream) -> dict[str, Any]:
 
 
 def _tracks_summary(events: EventStream) -> dict[str, Any]:
-    """How many events each camera reported, where there are several."""
+    """Number of events of each camera, where there are several."""
     if events.track is None:
         return {}
     each = np.bincount(events.track, minlength=events.tracks)
@@ -114,23 +114,23 @@ def _tracks_summary(events: EventStream) -> dict[str, Any]:
 
 
 def file_summary(file: EventFile) -> dict[str, Any]:
-    """What a file of events holds; all of it is read and checked, a chunk at a time.
+    """Summary of a file of events; all of it is read and checked, a chunk at a time.
 
     Raises:
-        CaptureError: A part cannot be read, or the events are unsound.
+        CaptureError: A part cannot be read, or the events are invalid.
     """
-    brighter, largest = 0, [-1.0, -1.0]
+    positive, largest = 0, [-1.0, -1.0]
     for first in range(0, len(file), CHUNK):
         last = min(first + CHUNK, len(file))
-        brighter += int((polarity(file.stored("p", first, last), file.path) > 0).sum())
+        positive += int((polarity(file.stored("p", first, last), file.path) > 0).sum())
         for i, name in enumerate(("x", "y")):
             largest[i] = max(largest[i], float(file.stored(name, first, last).max()))
     span = file.span_us() if file.unit is not None and len(file) else None
     # Without a stated size the sensor is at least as large as the largest coordinates say.
     width, height = file.size or (max(int(x) + 1, 1) for x in largest)
-    replace(file, size=(width, height), unit=file.unit or "us").check()  # any unit shows the order
+    replace(file, size=(width, height), unit=file.unit or "us").check()  # in any unit
     about = {
-        **_counts(len(file), brighter, span),
+        **_counts(len(file), positive, span),
         "width": width,
         "height": height,
         "size_from": "file" if file.size else "largest coordinates",
@@ -143,20 +143,20 @@ def file_summary(file: EventFile) -> dict[str, Any]:
 
 
 def _unit_of_layout(path: Path) -> str | None:
-    """The unit that an Ev-DeblurNeRF capture has, if the file is the events of one."""
+    """The unit of event times of an Ev-DeblurNeRF capture, if the file belongs to one."""
     folder = path.parent
     if not (llff_events.recognise(folder) and path.name == "events.h5"):
         return None
     return llff_events.variant_of(folder).event_unit
 
 
-def _counts(count: int, brighter: int, span_us: tuple[int, int] | None) -> dict[str, Any]:
+def _counts(count: int, positive: int, span_us: tuple[int, int] | None) -> dict[str, Any]:
     first, last = span_us or (None, None)
     seconds = (span_us[1] - span_us[0]) / 1e6 if span_us else 0.0
     return {
         "count": count,
-        "on": brighter,
-        "off": count - brighter,
+        "on": positive,
+        "off": count - positive,
         "t_first_us": first,
         "t_last_us": last,
         "duration_s": seconds if span_us else None,
@@ -192,7 +192,7 @@ def _frames_summary(frames: Frames) -> dict[str, Any]:
 
 
 def _depth_summary(depth: DepthMaps) -> dict[str, Any]:
-    """How much of the maps is known, judged by a few of them."""
+    """Size, share of known pixels and median depth, from a few of the maps."""
     some = np.linspace(0, len(depth) - 1, min(len(depth), DEPTH_SAMPLES)).astype(int)
     measured = np.stack([depth.at(int(frame)) for frame in some])
     known = measured[measured > 0]
@@ -207,7 +207,7 @@ def _depth_summary(depth: DepthMaps) -> dict[str, Any]:
 
 
 def _trajectory_summary(capture: Capture) -> dict[str, Any]:
-    """Tracks, when the first is known, and how long its path is."""
+    """Number of tracks, and the time span and path length of the first."""
     tracks = count_tracks(capture.trajectory)
     about: dict[str, Any] = {"kind": type(capture.trajectory).__name__, "tracks": tracks}
     known = capture.trajectory.known_us(0)

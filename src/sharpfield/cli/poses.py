@@ -14,7 +14,7 @@ from sharpfield.core.files import write_json
 from sharpfield.preparation.options import PoseOptions
 
 if TYPE_CHECKING:
-    from sharpfield.captures.paths.pose_layouts import OuterPath
+    from sharpfield.captures.paths.pose_layouts import ExternalPath
     from sharpfield.core.capture import Capture
     from sharpfield.preparation.poses.external import Mount
 
@@ -98,7 +98,7 @@ def poses_command(
 
 def _attach(
     original: "Capture",
-    path: "OuterPath",
+    path: "ExternalPath",
     mount: "Mount",
     bounds: tuple[float, float] | None,
     out: Path,

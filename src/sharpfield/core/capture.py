@@ -1,4 +1,4 @@
-"""A capture: everything recorded of one scene, on one clock, in one space."""
+"""A capture: everything recorded of one scene, on one clock and in one coordinate system."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,11 +15,11 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.frames import DepthMaps, Frames
 from sharpfield.core.protocols import Trajectory
 
-HELD_BACK_US = 2
-"""Rounding of times in published files; poses may end this much before an exposure does."""
+POSE_TOLERANCE_US = 2
+"""Rounding of times in published files: poses may end this much before an exposure does."""
 
 USUAL_THRESHOLD = 0.2
-"""Contrast threshold of an event camera that nobody has measured, in natural log."""
+"""Contrast threshold assumed for an event camera whose thresholds are unknown, natural log."""
 
 Note = Shaped[np.ndarray, "..."] | float | str
 """A remark about a capture, for people to read: no computation depends on it."""
@@ -79,28 +79,28 @@ class Known:
 
 @dataclass(frozen=True)
 class Clock:
-    """Converts us on disk to the 0...1 that rays carry, once.
+    """Converts times in us to the unit times 0...1 that rays carry.
 
-    float32 counts whole us only up to 16.8 s, but as a fraction of a capture it is good to 3.6 us
-    over a minute, which is fine for poses. Differences of event times are taken in int64.
+    float32 represents whole us only up to 16.8 s, but a fraction of a capture of one minute is
+    accurate to 3.6 us, which suffices for poses. Differences of event times are computed in int64.
     """
 
     origin_us: int
     span_us: int
 
     def unit(self, t_us: Int64[np.ndarray, "*n"] | int) -> Float[np.ndarray, "*n"]:
-        """Fraction of the capture, float64; an array also for a single time."""
+        """Times as a fraction of the capture, float64; an array also for a single time."""
         return np.asarray((np.asarray(t_us, np.int64) - self.origin_us) / self.span_us)
 
     def us(self, unit: Float[np.ndarray, "*n"] | float) -> Int64[np.ndarray, "*n"]:
-        """Back to us, rounded; an array also for a single time."""
+        """Times in us, rounded; an array also for a single time."""
         since = np.rint(np.asarray(unit) * self.span_us).astype(np.int64)
         return np.asarray(since + self.origin_us)
 
 
 @dataclass(frozen=True)
 class Split:
-    """Which frames are learned from and which are held out, by index."""
+    """Training frames and held-out test frames, by index."""
 
     train: Int64[np.ndarray, "a"]
     test: Int64[np.ndarray, "b"]
@@ -122,15 +122,15 @@ class Capture:
     frames: Frames | None = None
     events: EventStream | None = None
     test_events: EventStream | None = None
-    """What event cameras on held-out tracks reported: to be predicted, never learned from."""
+    """Events of cameras on held-out tracks, for testing only."""
     split: Split = Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
     points: Float[np.ndarray, "m 3"] | None = None
-    """Sparse scene points, where a reconstruction came with the capture."""
+    """Sparse scene points of a reconstruction, if there is one."""
     depth: DepthMaps | None = None
-    """What a depth camera measured, a map for each frame."""
+    """Maps of a depth camera, one for each frame."""
     name: str = "capture"
     source: str = ""
-    """The layout it was read from."""
+    """The layout that it was read from."""
     known: Known = Known()
     """What is known, estimated or unknown of poses, lens, bounds and event camera."""
     notes: dict[str, Note] = field(default_factory=dict[str, Note])
@@ -147,8 +147,8 @@ class Capture:
                 do="check the last two columns of the poses, or `near` and `far`",
             )
         if self.frames is not None:
-            self._frames_agree(self.frames)
-            self._poses_cover(self.frames)
+            self._expect_fitting_frames(self.frames)
+            self._expect_covered_exposures(self.frames)
         if self.depth is not None and len(self.depth) != len(self.frames or ()):
             raise CaptureError(
                 "there must be one depth map for each frame",
@@ -201,14 +201,14 @@ class Capture:
             raise CaptureError(
                 "this needs measured depth, and the capture has none",
                 where=self.name,
-                do="take a capture of a depth camera, or one of `sharpfield simulate --scene room`",
+                do="use a capture of a depth camera, or one of `sharpfield simulate --scene room`",
             )
         return self.depth
 
     def frame_pose(self, frames: Int64[np.ndarray, "m"]) -> Float[Tensor, "m 3 4"]:
-        """World-from-camera poses in the middle of the exposures of some frames.
+        """World-from-camera poses at the middle of the exposures of some frames.
 
-        With a rolling shutter, of that of the middle row.
+        With a rolling shutter, at the middle of the exposure of the middle row.
         """
         held = self.needed_frames
         exposure = held.exposure
@@ -217,7 +217,7 @@ class Capture:
         return self.trajectory.pose(time, torch.as_tensor(held.track[frames]))
 
     def without(self, *, frames: bool = False, events: bool = False) -> "Capture":
-        """The same capture with frames or events taken away."""
+        """The same capture without frames (and depth), or without events."""
         return replace(
             self,
             frames=None if frames else self.frames,
@@ -226,7 +226,7 @@ class Capture:
             test_events=None if events else self.test_events,
         )
 
-    def _frames_agree(self, frames: Frames) -> None:
+    def _expect_fitting_frames(self, frames: Frames) -> None:
         if (frames.width, frames.height) != self.camera.size:
             raise CaptureError(
                 "images and camera have different sizes",
@@ -243,7 +243,7 @@ class Capture:
                 got=f"indices {used.min()} to {used.max()} of {len(frames)} frames",
             )
 
-    def _poses_cover(self, frames: Frames) -> None:
+    def _expect_covered_exposures(self, frames: Frames) -> None:
         for track in np.unique(frames.track):
             known = self.trajectory.known_us(int(track))
             if known is None:
@@ -251,7 +251,9 @@ class Capture:
             member = np.flatnonzero(frames.track == track)
             opens, closes = frames.exposure.open_us[member], frames.exposure.close_us[member]
             closes = closes + int(frames.exposure.readout_us(frames.height))
-            wrong = member[(opens < known[0] - HELD_BACK_US) | (closes > known[1] + HELD_BACK_US)]
+            wrong = member[
+                (opens < known[0] - POSE_TOLERANCE_US) | (closes > known[1] + POSE_TOLERANCE_US)
+            ]
             if len(wrong):
                 i = int(wrong[0])
                 raise CaptureError(
@@ -265,7 +267,7 @@ class Capture:
 
 
 def _unit_hint(frames: Frames, known: tuple[int, int]) -> str:
-    """A factor of 1000 between two clocks is nearly always a unit."""
+    """Advice where two clocks differ by a factor of 1000: nearly always a wrong unit."""
     last_frame, last_pose = int(frames.exposure.close_us.max()), max(abs(known[1]), 1)
     ratio = max(last_frame, 1) / last_pose
     if 300 < ratio < 3000:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from sharpfield.captures.blocks import blocks_of, limited, parsed
+from sharpfield.captures.blocks import blocks_of, parse_block, restrict_to_block
 from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
@@ -176,5 +176,5 @@ def block_of(capture: Capture, block: str) -> Capture:
     """The block of a capture that "2/4" names; all of it if nothing does."""
     if not block:
         return capture
-    index, count = parsed(block)
-    return limited(capture, blocks_of(capture, count)[index])
+    index, count = parse_block(block)
+    return restrict_to_block(capture, blocks_of(capture, count)[index])

@@ -53,7 +53,7 @@ def test_other_texts_are_refused(tmp_path, text, message):
 
 def test_what_is_no_path_is_refused(tmp_path):
     np.savez(tmp_path / "still.npz", poses=turning(TIMES))
-    with pytest.raises(CaptureError, match="holds no path with times"):
+    with pytest.raises(CaptureError, match="holds no trajectory with times"):
         read_poses(tmp_path / "still.npz")
     with pytest.raises(CaptureError, match="not found"):
         read_poses(tmp_path / "nowhere.txt")

@@ -109,16 +109,16 @@ def test_hand_eye_is_a_matrix_or_a_line(tmp_path: Path) -> None:
     for name in ("matrix.txt", "line.txt"):
         np.testing.assert_allclose(read_hand_eye(tmp_path / name), one, atol=1e-12)
     (tmp_path / "wrong.txt").write_text("1 2 3\n")
-    with pytest.raises(CaptureError, match="this is no pose"):
+    with pytest.raises(CaptureError, match="not a pose"):
         read_hand_eye(tmp_path / "wrong.txt")
 
 
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("1 2 3\n", CaptureError, "cannot tell the layout"),
-        ("", CaptureError, "cannot tell the layout"),
-        ("time,x_m\n0,0\n", OptionError, "must name its time"),
+        ("1 2 3\n", CaptureError, "unknown layout of a trajectory"),
+        ("", CaptureError, "unknown layout of a trajectory"),
+        ("time,x_m\n0,0\n", OptionError, "must have one column of times"),
         ("t_s,x_m\n0,a\n", CaptureError, "cannot read the trajectory"),
         ("t_s,x_m\n", CaptureError, "cannot read the trajectory"),
         ("0,0,0,0,0.5,0,0,0\n", CaptureError, "length one"),

@@ -31,7 +31,7 @@ from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import choose_images
 from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
-from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Thresholds
+from sharpfield.core.capture import POSE_TOLERANCE_US, Capture, Clock, Known, Note, Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.core.frames import Exposure, Frames
@@ -181,7 +181,7 @@ def _off_trajectory(
 ) -> Bool[np.ndarray, "n"]:
     """Which frames were not taken on the trajectory."""
     first, last = path.known_us(0)
-    begin, end = exposure.open_us + HELD_BACK_US, exposure.close_us - HELD_BACK_US
+    begin, end = exposure.open_us + POSE_TOLERANCE_US, exposure.close_us - POSE_TOLERANCE_US
     outside = exposure.instant & ((begin < first) | (end > last))
     time = torch.from_numpy(path.clock.unit(exposure.middle_us))
     expected = path.pose(time, torch.zeros(len(table)).long())

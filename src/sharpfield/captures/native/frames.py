@@ -1,14 +1,13 @@
-"""Measured depth in our own layout: `[depth]` with its unit and camera, and PNG files in `depth/`.
+"""Frames and measured depth in our own layout.
 
-The files have the names of the frames' own, 16 bit, grey, 0 where nothing was measured.
+Frames have a table each in `[frames] each`, and PNG files in `frames/` and `truth/`. A table gives
+`name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or "none"; "train"),
+`file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the defaults in brackets;
+`blur_px` is the true length of the motion blur, where known. `truth/depth.npy` and `truth/flow.npy`
+are of all frames, where known. `[frames] row_delay_us` (0) is that of a rolling shutter.
 
-Frames in our own layout: a line each in `[frames] each`, and PNG files in `frames/`, `truth/`.
-
-A line gives `name`, `open_us` and `close_us`; `track` (0), `use` ("train", "test", "both" or
-"none"; "train"), `file` (NAME.png) and `truth` (whether `truth/` has the sharp image) have the
-defaults in brackets; `blur_px` is the true length of the motion blur, where known.
-`truth/depth.npy` and `truth/flow.npy` are of all frames, where known. `[frames] row_delay_us` (0)
-is that of a rolling shutter.
+Measured depth has the table `[depth]` with its unit and camera, and PNG files in `depth/` with the
+names of the frames' files: 16 bit, grey, 0 where nothing was measured.
 """
 
 import re
@@ -31,14 +30,14 @@ DEPTH = "depth"
 
 
 def write_depth(depth: DepthMaps, files: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Write the maps under the names of the frames' files, and return what describes them."""
+    """Write depth maps under the names of the frames' files, and return their table."""
     for file, stored in zip(files, depth.stored, strict=True):
         write_image(folder / DEPTH / file, np.asarray(stored)[..., None])
     return {"unit": depth.unit, "camera": camera_table(depth.camera)}
 
 
 def read_depth(about: Table, files: Sequence[str], folder: Path) -> DepthMaps:
-    """Read what `write_depth` wrote.
+    """Read the depth maps that `write_depth` wrote.
 
     Raises:
         CaptureError: A map is missing or malformed.
@@ -53,10 +52,10 @@ def read_depth(about: Table, files: Sequence[str], folder: Path) -> DepthMaps:
 
 
 def decode_depth(path: Path) -> UInt16[np.ndarray, "h w"]:
-    """A depth map as stored.
+    """Read a depth map as stored.
 
     Raises:
-        CaptureError: The file is missing, or not a grey image of 16 bit.
+        CaptureError: The file is missing, or is not a grey image of 16 bit.
     """
     image = read_image(path)
     if image.dtype != np.uint16 or image.shape[-1] != 1:
@@ -68,28 +67,30 @@ def decode_depth(path: Path) -> UInt16[np.ndarray, "h w"]:
 
 FRAMES, TRUTH = "frames", "truth"
 GEOMETRY = {"depth": (), "flow": (2,)}
-"""Fields of `Frames` that are kept as arrays of one entry per pixel, and their trailing shape."""
+"""Fields of `Frames` with an entry per pixel, and their trailing shape."""
 
 USES = {(True, False): "train", (False, True): "test", (True, True): "both", (False, False): "none"}
-"""What `use` says of a frame, by whether it is learned from and whether it is held out."""
+"""Values of `use`, by whether a frame is for training and whether it is held out."""
 
 PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 KEYS = ("name", "open_us", "close_us", "track", "use", "file", "truth", "blur_px")
 
 
 def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, Any]]:
-    """Write the images, and return the lines that describe the frames.
+    """Write the images, and return the table of each frame.
 
     Raises:
-        CaptureError: The truth is of another size or type than the images, or the split is not
-            in the order of frames.
+        CaptureError: Sharp images differ in size or type from the frames, or the split is not in
+            ascending order.
     """
     _expect_same_kind(frames)
     for part in (split.train, split.test):
         if (np.diff(part) <= 0).any():
-            raise CaptureError("a split must name frames in ascending order, each once", got=part)
+            raise CaptureError(
+                "a split must list frames in ascending order, each once", got=part, do="sort it"
+            )
     index = np.arange(len(frames))
-    learned, held_out = np.isin(index, split.train), np.isin(index, split.test)
+    train, held_out = np.isin(index, split.train), np.isin(index, split.test)
     files = files_of(frames.names)
     tables = []
     for i, file in enumerate(files):
@@ -101,7 +102,7 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
         }
         if frames.track[i]:
             table["track"] = int(frames.track[i])
-        if (use := USES[bool(learned[i]), bool(held_out[i])]) != "train":
+        if (use := USES[bool(train[i]), bool(held_out[i])]) != "train":
             table["use"] = use
         if file != f"{frames.names[i]}.png":
             table["file"] = file
@@ -120,10 +121,10 @@ def write_frames(frames: Frames, split: Split, folder: Path) -> list[dict[str, A
 
 
 def read_frames(about: Table, folder: Path) -> tuple[Frames, Split, list[str]]:
-    """Read what `write_frames` wrote: the frames, their split, and the names of their files.
+    """Read frames, their split, and the names of their files, as `write_frames` wrote them.
 
     Raises:
-        CaptureError: A line or an image is missing or malformed, or images differ in size.
+        CaptureError: A table or an image is missing or malformed, or images differ in size.
     """
     about.expect_only("encoding", "row_delay_us", "each")
     tables = about.tables("each")
@@ -163,14 +164,14 @@ def _read_truth(
     known = np.array([table.yes("truth", False) for table in tables])
     if not known.any():
         return None, None
-    there = [path for path, one in zip(paths, known, strict=True) if one]
-    first = read_image(there[0])
+    existing = [path for path, one in zip(paths, known, strict=True) if one]
+    first = read_image(existing[0])
     _expect_like(first[None], images, paths[0].parent)
     unknown = np.zeros_like(first)
     truth = image_stack(
         list(zip(paths, known.tolist(), strict=True)),
         lambda item: read_image(item[0]) if item[1] else unknown,
-        sources=there,
+        sources=existing,
         kind="truth",
     )
     _expect_like(truth, images, paths[0].parent)
@@ -191,7 +192,7 @@ def _expect_like(
 def _read_geometry(
     folder: Path, images: Shaped[np.ndarray, "n h w c"]
 ) -> dict[str, Float32[np.ndarray, "..."]]:
-    """Depth and flow of all frames, those that are there."""
+    """True depth and optical flow of all frames, as far as their files exist."""
     found = {}
     for name, trailing in GEOMETRY.items():
         path = folder / f"{name}.npy"
@@ -210,36 +211,41 @@ def _read_geometry(
 
 
 def _split(tables: Sequence[Table]) -> Split:
-    meaning = {use: key for key, use in USES.items()}
-    chosen = []
+    flags_of = {use: flags for flags, use in USES.items()}
+    flags = []
     for table in tables:
         use = table.text("use", "train")
-        if use not in meaning:
+        if use not in flags_of:
             raise CaptureError(
                 "unknown use of a frame",
                 where=table.where,
                 got=use,
-                do=f"write one of {', '.join(meaning)}",
+                do=f"write one of {', '.join(flags_of)}",
             )
-        chosen.append(meaning[use])
-    learned, held_out = np.array(chosen).T
-    return Split(train=np.flatnonzero(learned), test=np.flatnonzero(held_out))
+        flags.append(flags_of[use])
+    train, held_out = np.array(flags).T
+    return Split(train=np.flatnonzero(train), test=np.flatnonzero(held_out))
 
 
 def files_of(names: Sequence[str]) -> list[str]:
-    """The names themselves where every file system can hold them, else numbers."""
-    different = len({name.casefold() for name in names}) == len(names)
-    if different and all(PLAIN_NAME.fullmatch(name) for name in names):
+    """File names of frames: their own names where every file system allows these, else numbers."""
+    unique = len({name.casefold() for name in names}) == len(names)
+    if unique and all(PLAIN_NAME.fullmatch(name) for name in names):
         return [f"{name}.png" for name in names]
     return [f"{i:06d}.png" for i in range(len(names))]
 
 
 def _inside(table: Table, folder: Path) -> str:
-    """The file of a frame, which must lie in the capture's own folder."""
+    """The file name of a frame, which must lie in the capture's own folder."""
     file = table.text("file", f"{table.text('name')}.png")
     root = (folder / FRAMES).resolve()
     if not (root / file).resolve().is_relative_to(root):
-        raise CaptureError("a frame's file lies outside the capture", where=table.where, got=file)
+        raise CaptureError(
+            "a frame's file lies outside the capture",
+            where=table.where,
+            got=file,
+            do=f"put it into {FRAMES}/",
+        )
     return file
 
 

@@ -1,16 +1,16 @@
-"""Our own layout. Writing a capture and reading it again gives exactly the same capture.
+"""Our own layout. A capture that is written and read again is exactly the same.
 
 capture.toml       camera, clock, depth bounds, tracks, exposures, split, what is known, notes
 frames/NAME.png    8 or 16 bit, grey or RGB
 truth/NAME.png     sharp images at mid-exposure, where known
-depth/NAME.png     what a depth camera measured, 16 bit, if there was one
+depth/NAME.png     maps of a depth camera, 16 bit, if there was one
 events.h5          see `storage.event_writer`
 test_events.h5     likewise, of held-out cameras, if any
 truth/depth.npy, truth/flow.npy     of all frames, where known; see `Frames`
-trajectory.npz     see `captures.native_trajectory`
+trajectory.npz     see `captures.native.trajectory`
 points.npy         sparse scene points, if any
 notes.npz          notes that are arrays, if any
-cache/             derived; delete it when you like
+cache/             the disk cache, see `storage.disk_cache`; delete it when you like
 
 A capture that was just recorded has no poses yet. It is stored with a camera that stands still, and
 `poses = "unknown"` in its table `[known]` says that this is only a placeholder.
@@ -72,7 +72,7 @@ def write(capture: Capture, folder: Path | str) -> None:
 
     Raises:
         CaptureError: The folder holds something that is not a capture, or the capture holds
-            something the layout has no place for.
+            something that the layout cannot store.
     """
     folder = Path(folder)
     expect_replaceable(folder, recognise)
@@ -96,13 +96,13 @@ def describe(
     frames: list[dict[str, Any]] | None,
     depth: dict[str, Any] | None = None,
 ) -> None:
-    """Write all that is not images or events, for which these must be in the folder already.
+    """Write everything but images and events, which must be in the folder already.
 
     Args:
-        capture: Of which images and events are not looked at.
+        capture: Its images and events are not read.
         folder: Where the description goes.
-        frames: The line of each frame, see `captures.native_frames`.
-        depth: The table of measured depth, see `captures.native_depth`.
+        frames: The table of each frame, see `captures.native.frames`.
+        depth: The table of measured depth, see `captures.native.frames`.
     """
     arrays = {k: note for k, note in capture.notes.items() if isinstance(note, np.ndarray)}
     about: dict[str, Any] = {
@@ -147,10 +147,10 @@ def read(folder: Path) -> Capture:
 
 
 def expect_poses(capture: Capture, where: object) -> Capture:
-    """The capture itself, if its poses are no placeholder.
+    """Return the capture itself if its poses are known.
 
     Raises:
-        CaptureError: They are.
+        CaptureError: They are unknown: the trajectory is a placeholder.
     """
     if capture.known.poses == "unknown":
         raise CaptureError(
@@ -163,14 +163,14 @@ def expect_poses(capture: Capture, where: object) -> Capture:
 
 
 def read_unposed(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
-    """Read a capture, whether its poses are known or not: what comes before training needs none.
+    """Read a capture, whether its poses are known or not.
 
-    Where they are not, `known.poses` is "unknown" and the trajectory is a camera that stands still
-    at the origin. Likewise `known.intrinsics` is "unknown" where the focal length is only a
-    placeholder (the image's width), and `known.bounds` where `near` and `far` are.
+    Where they are unknown, `known.poses` is "unknown" and the trajectory is a static camera at the
+    origin. Likewise `known.intrinsics` is "unknown" where the focal length is only a placeholder
+    (the image's width), and `known.bounds` where `near` and `far` are placeholders.
 
     Raises:
-        CaptureError: Something is missing or malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     about = read_toml(folder / DESCRIPTION)
     _expect_version(about)
@@ -178,8 +178,8 @@ def read_unposed(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
         *("format", "version", "name", "source", "near", "far", "camera", "clock"),
         *("trajectory", "known", "notes", "frames", "depth", "events"),
     )
-    timing = about.table("clock")
-    clock = Clock(timing.whole("origin_us"), timing.whole("span_us"))
+    times = about.table("clock")
+    clock = Clock(times.whole("origin_us"), times.whole("span_us"))
     camera = read_camera(about.table("camera"))
     frames, split, depth = None, NO_SPLIT, None
     if "frames" in about.values:
@@ -221,7 +221,7 @@ def read_unposed(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
 
 
 def _read_events(about: Table, path: Path, camera: Camera, clock: Clock) -> EventStream:
-    """The events; `[events] unit` is for files made elsewhere, which may not say it."""
+    """The events; `[events] unit` is for files made elsewhere, which may not state it."""
     unit = about.table("events", optional=True).text("unit", "")
     with open_events(path, unit=unit or None) as file:
         sized = file if file.size else replace(file, size=camera.size)
@@ -241,16 +241,17 @@ def _expect_tracks(
     *,
     where: Path,
 ) -> None:
-    """Make sure that frames and events are of tracks the trajectory knows."""
+    """Check that the tracks of frames and events have poses."""
     known = count_tracks(trajectory)
     named = [] if frames is None else [frames.track]
     named += [one.track for one in streams if one is not None and one.track is not None]
     for track in named:
         if len(track) and not (0 <= track.min() and track.max() < known):
             raise CaptureError(
-                "a frame or an event is of a track that has no poses",
+                "a frame or an event belongs to a track without poses",
                 where=where,
                 got=f"tracks {track.min()} to {track.max()}, {known} with poses",
+                do="add the missing tracks to the trajectory, or correct `track`",
             )
 
 
@@ -258,7 +259,7 @@ def _expect_version(about: Table) -> None:
     found = about.text("format"), about.whole("version")
     if found != (FORMAT, VERSION):
         raise CaptureError(
-            "unknown format of capture",
+            "unknown format of a capture",
             where=about.where,
             got=f"{found[0]} version {found[1]}",
             do=f"this program reads {FORMAT} version {VERSION}",

@@ -1,6 +1,7 @@
-"""A camera as a table of `capture.toml`: the fields of `Camera`, by their names.
+"""Cameras and trajectories in our own layout.
 
-Trajectories in our own layout: `trajectory.npz`, described by a table of `capture.toml`.
+A camera is a table of `capture.toml` with the fields of `Camera` by their names. A trajectory is
+`trajectory.npz`, described by a table of `capture.toml`.
 
 Times are int64 us and poses float64 `[3 4]`, world-from-camera, OpenCV axes. The table's `kind` is
 
@@ -30,13 +31,13 @@ from sharpfield.storage.toml_tables import Table
 
 
 def camera_table(camera: Camera) -> dict[str, Any]:
-    """What describes a camera."""
+    """The table of a camera."""
     table = dataclasses.asdict(camera)
     return table | {"distortion": list(camera.distortion)}
 
 
 def read_camera(table: Table) -> Camera:
-    """Read what `camera_table` describes.
+    """Read a table of `camera_table`.
 
     Raises:
         CaptureError: A value is missing, malformed or unknown.
@@ -65,7 +66,7 @@ def write_trajectory(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
     """Write the arrays of a trajectory, and return the table that describes it.
 
     Raises:
-        CaptureError: It is of another kind, for instance learned.
+        CaptureError: It is of another kind, for instance a learned one.
     """
     table, arrays = _packed(trajectory)
     write_arrays(folder / FILE, arrays)
@@ -73,7 +74,7 @@ def write_trajectory(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
 
 
 def read_trajectory(table: Table, folder: Path, clock: Clock) -> Trajectory:
-    """Read what `write_trajectory` wrote.
+    """Read the trajectory that `write_trajectory` wrote.
 
     Raises:
         CaptureError: The file is missing or malformed.

@@ -1,11 +1,11 @@
-"""A camera's path in a file of its own, apart from any capture: where to look from, and when.
+"""A camera trajectory in a file of its own, apart from any capture.
 
-- TUM: a text with a line `t x y z qx qy qz qw` per pose; t in seconds, the rotation a quaternion,
-  both from the camera to the world; lines that begin with # are left out.
-- Ours: the `trajectory.npz` of a capture, with arrays `times_us` and `poses`; where it holds
-  several tracks that move (`0_times_us`, ...), the first.
+- TUM: a text with a line `t x y z qx qy qz qw` per pose; t in seconds, position and rotation
+  (a quaternion) world-from-camera; lines that begin with # are ignored.
+- Ours: the `trajectory.npz` of a capture, with arrays `times_us` and `poses`; of several moving
+  tracks (`0_times_us`, ...), the first.
 
-Axes are OpenCV's, and times are on the clock of the capture that the path is used with.
+Axes are OpenCV's, and times are on the clock of the capture that the trajectory is used with.
 
 Source: Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems* (IROS 2012).
 """
@@ -28,17 +28,17 @@ Path3 = tuple[Int64[np.ndarray, "p"], Float64[np.ndarray, "p 3 4"]]
 TUM_COLUMNS = 8
 
 UNIT_LENGTH = 1e-2
-"""How far the length of a quaternion may be from one; files round to four digits or more."""
+"""Tolerance of the length of a quaternion; files round to four digits or more."""
 
 
 def read_poses(path: Path) -> Path3:
-    """Times in us and world-from-camera poses of a file.
+    """Read times in us and world-from-camera poses from a file.
 
     Raises:
-        CaptureError: The file is missing or malformed, or holds no path.
+        CaptureError: The file is missing or malformed, or holds no trajectory.
     """
     if not path.is_file():
-        raise CaptureError("trajectory file not found", where=path)
+        raise CaptureError("trajectory file not found", where=path, do="check the path")
     times_us, poses = _native(path) if path.suffix == ".npz" else _tum(path)
     check_poses(poses, path)
     return times_us, poses
@@ -47,10 +47,10 @@ def read_poses(path: Path) -> Path3:
 def poses_of_quaternions(
     rows: Float64[np.ndarray, "p 7"], where: object, *, do: str = "check the order of the columns"
 ) -> Float64[np.ndarray, "p 3 4"]:
-    """Poses of rows `x y z qx qy qz qw`.
+    """Poses `[R | t]` from rows `x y z qx qy qz qw`.
 
     Raises:
-        CaptureError: A quaternion is not of length one; `do` says how the columns should be.
+        CaptureError: A quaternion does not have length one; `do` states the order of columns.
     """
     length = np.linalg.norm(rows[:, 3:], axis=1)
     wrong = np.flatnonzero(~(np.abs(length - 1) < UNIT_LENGTH))
@@ -72,10 +72,10 @@ def _native(path: Path) -> Path3:
             times_us, poses = arrays[prefix + "times_us"], arrays[prefix + "poses"]
             return times_us.astype(np.int64), poses.astype(np.float64)
     raise CaptureError(
-        "this file holds no path with times",
+        "this file holds no trajectory with times",
         where=path,
         got=", ".join(arrays) or "no arrays",
-        do="it needs the arrays `times_us` and `poses`; cameras that stand still have no path",
+        do="it needs the arrays `times_us` and `poses`; static cameras have no trajectory",
     )
 
 

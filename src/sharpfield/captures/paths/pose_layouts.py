@@ -1,14 +1,14 @@
-"""Paths and poses that other programs wrote, in their own layouts.
+"""Trajectories and poses written by other programs, in their own file layouts.
 
-- `tum`, `npz`: see `captures.pose_file`.
-- `euroc`: CSV of `timestamp [ns], x, y, z, qw, qx, qy, qz`, and further columns that are left
-  alone; the first line begins with #.
+- `tum`, `npz`: see `captures.paths.pose_file`.
+- `euroc`: CSV of `timestamp [ns], x, y, z, qw, qx, qy, qz`, and further columns that are ignored;
+  the first line begins with #.
 - `kitti`: a line of twelve numbers, a `[3 4]` matrix, per pose. Times are in `times.txt` (s)
   beside it or one folder up; without it there must be a pose for each frame.
-- `csv`: what motor encoders and stages log. The first line names the columns: a time `t_s`,
+- `csv`: logs of motor encoders and motion stages. The first line names the columns: a time `t_s`,
   `t_ms`, `t_us` or `t_ns`; positions `x_m`, `y_mm`, ...; rotations `rx_deg`, `ry_rad`, ... about
-  the axes, or a quaternion `qx, qy, qz, qw`. What is not named is zero. Rotations about several
-  axes follow each other in the order x, y, z, about axes that stand still.
+  the axes, or a quaternion `qx, qy, qz, qw`. Missing columns are zero. Rotations about several
+  axes are applied in the order x, y, z, about fixed axes.
 - `colmap`: a folder with a model; poses belong to images by name and have no times.
 
 Sources: Burri et al., "The EuRoC micro aerial vehicle datasets" (IJRR 2016); Geiger et al., "Are we
@@ -46,48 +46,48 @@ NANOSECONDS = 1000
 
 
 @dataclass(frozen=True)
-class OuterPath:
-    """Poses that came from elsewhere."""
+class ExternalPath:
+    """Poses from a file of another program."""
 
     layout: PathLayout
     poses: Float64[np.ndarray, "p 3 4"]
-    """World-from-body; the body is the camera unless a hand-eye transform says otherwise."""
+    """World-from-body; the body is the camera unless there is a hand-eye transform."""
     times_us: Int64[np.ndarray, "p"] | None = None
-    """By the clock of the file."""
+    """On the clock of the file."""
     names: tuple[str, ...] | None = None
     """Of the images, without suffix, where poses belong to images."""
     model: Model | None = None
-    """Where a reconstruction came along."""
+    """The reconstruction, if the poses are part of one."""
 
 
-def read_path(path: Path, layout: PathLayout | None = None) -> OuterPath:
-    """Read a path in any of the layouts.
+def read_path(path: Path, layout: PathLayout | None = None) -> ExternalPath:
+    """Read a trajectory in any of the layouts.
 
     Args:
         path: The file, or the folder of a COLMAP model.
         layout: By default it is recognised.
 
     Raises:
-        CaptureError: It is missing or malformed, or its layout is not clear.
+        CaptureError: It is missing or malformed, or its layout is ambiguous.
     """
     if not path.exists():
-        raise CaptureError("trajectory not found", where=path)
+        raise CaptureError("trajectory not found", where=path, do="check the path")
     kind = layout or path_layout(path)
     if kind == "colmap":
         return _colmap(path)
     if kind in ("tum", "npz"):
         times_us, poses = read_poses(path)
-        return OuterPath(kind, poses, times_us)
-    found = {"euroc": _euroc, "kitti": _kitti, "csv": _stage}[kind](path)
+        return ExternalPath(kind, poses, times_us)
+    found = {"euroc": _euroc, "kitti": _kitti, "csv": _motion_log}[kind](path)
     check_poses(found.poses, path)
     return found
 
 
 def path_layout(path: Path) -> PathLayout:
-    """The layout of a path, judged by its name and its first lines.
+    """The layout of a trajectory file, by its name and its first lines.
 
     Raises:
-        CaptureError: None fits.
+        CaptureError: No layout fits.
     """
     if path.is_dir():
         return "colmap"
@@ -108,23 +108,23 @@ def path_layout(path: Path) -> PathLayout:
     elif len(first.split()) == KITTI_COLUMNS:
         return "kitti"
     raise CaptureError(
-        "cannot tell the layout of this trajectory",
+        "unknown layout of a trajectory",
         where=path,
         got=first[:80] or "an empty file",
-        do="say --layout tum, euroc, kitti or csv; tum has 8 columns, kitti 12, csv names its own",
+        do="give --layout tum (8 columns), euroc, kitti (12 columns) or csv (named columns)",
     )
 
 
 def read_hand_eye(path: Path) -> Float64[np.ndarray, "3 4"]:
-    """Where the camera sits on the body that a file tracks: body-from-camera.
+    """Read the pose of the camera on the tracked body: body-from-camera.
 
-    A text of a `[3 4]` or `[4 4]` matrix, or of one line `x y z qx qy qz qw`.
+    The file is a text of a `[3 4]` or `[4 4]` matrix, or of one line `x y z qx qy qz qw`.
 
     Raises:
         CaptureError: It is missing or malformed.
     """
     if not path.is_file():
-        raise CaptureError("hand-eye file not found", where=path)
+        raise CaptureError("hand-eye file not found", where=path, do="check the path")
     rows = _numbers(path, None)
     if rows.size == POSE_COLUMNS:
         pose = poses_of_quaternions(rows.reshape(1, POSE_COLUMNS), path)
@@ -132,7 +132,7 @@ def read_hand_eye(path: Path) -> Float64[np.ndarray, "3 4"]:
         pose = rows[None, :3]
     else:
         raise CaptureError(
-            "this is no pose",
+            "not a pose",
             where=path,
             got=f"{rows.shape[0]} lines of {rows.shape[1]} numbers",
             do="write a 3x4 or 4x4 matrix, or one line `x y z qx qy qz qw`: body from camera",
@@ -141,49 +141,50 @@ def read_hand_eye(path: Path) -> Float64[np.ndarray, "3 4"]:
     return pose[0]
 
 
-def _colmap(path: Path) -> OuterPath:
-    place = find_model(path)
-    if place is None:
+def _colmap(path: Path) -> ExternalPath:
+    folder = find_model(path)
+    if folder is None:
         raise CaptureError("no COLMAP model", where=path, do="give the folder of images.bin")
-    model = read_model(place)
+    model = read_model(folder)
     names = tuple(Path(name).with_suffix("").as_posix() for name in model.names)
-    return OuterPath("colmap", model.poses, names=names, model=model)
+    return ExternalPath("colmap", model.poses, names=names, model=model)
 
 
-def _euroc(path: Path) -> OuterPath:
+def _euroc(path: Path) -> ExternalPath:
     rows = _numbers(path, ",")
     if rows.shape[1] < EUROC_COLUMNS:
         raise _malformed(path, f"{rows.shape[1]} columns", "t [ns], x, y, z, qw, qx, qy, qz")
     poses = poses_of_quaternions(rows[:, [1, 2, 3, 5, 6, 7, 4]], path)
-    with path.open(encoding="utf-8", errors="replace") as file:  # float64 does not hold ns of 1970
+    with path.open(encoding="utf-8", errors="replace") as file:  # float64 cannot hold ns since 1970
         times = [line.split(",")[0] for line in file if line.strip() and line.strip()[0] != "#"]
-    return OuterPath(
+    return ExternalPath(
         "euroc",
         poses,
         np.array([int(float(t)) if "." in t else int(t) for t in times]) // NANOSECONDS,
     )
 
 
-def _kitti(path: Path) -> OuterPath:
+def _kitti(path: Path) -> ExternalPath:
     rows = _numbers(path, None)
     if rows.shape[1] != KITTI_COLUMNS:
         raise _malformed(path, f"{rows.shape[1]} columns", "twelve numbers per pose, row by row")
     poses = _orthonormal(rows.reshape(-1, 3, 4))
-    beside = [place / "times.txt" for place in (path.parent, path.parent.parent)]
-    times_file = next((file for file in beside if file.is_file()), None)
+    candidates = [folder / "times.txt" for folder in (path.parent, path.parent.parent)]
+    times_file = next((file for file in candidates if file.is_file()), None)
     if times_file is None:
-        return OuterPath("kitti", poses)
+        return ExternalPath("kitti", poses)
     seconds = _numbers(times_file, None)[:, 0]
     if len(seconds) != len(poses):
         raise CaptureError(
             "there must be one time for each pose",
             where=times_file,
             got=f"{len(seconds)} times, {len(poses)} poses",
+            do="give the times.txt of this trajectory",
         )
-    return OuterPath("kitti", poses, np.rint(seconds * 1e6).astype(np.int64))
+    return ExternalPath("kitti", poses, np.rint(seconds * 1e6).astype(np.int64))
 
 
-def _stage(path: Path) -> OuterPath:
+def _motion_log(path: Path) -> ExternalPath:
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         rows = [row for row in csv.reader(file) if row and not row[0].lstrip().startswith("#")]
     names = [name.strip().lower() for name in rows[0]] if rows else []
@@ -201,31 +202,31 @@ def _stage(path: Path) -> OuterPath:
     ]
     if len(times) != 1:
         raise OptionError(
-            "a log of a stage must name its time and the unit of it",
+            "a log of motion must have one column of times with their unit",
             where=path,
             got=", ".join(names),
             do="name one column t_s, t_ms, t_us or t_ns",
         )
     time, unit = times[0]
     times_us = np.rint(columns[time] * (PER_SECOND["us"] / PER_SECOND[unit])).astype(np.int64)
-    place = np.stack([_measured(columns, axis, LENGTHS) for axis in "xyz"], -1)
+    position = np.stack([_column_in_base_unit(columns, axis, LENGTHS) for axis in "xyz"], -1)
     if {"qx", "qy", "qz", "qw"} <= columns.keys():
         quaternion = np.stack([columns[q] for q in ("qx", "qy", "qz", "qw")], -1)
-        return OuterPath(
-            "csv", poses_of_quaternions(np.concatenate([place, quaternion], -1), path), times_us
+        return ExternalPath(
+            "csv", poses_of_quaternions(np.concatenate([position, quaternion], -1), path), times_us
         )
     rotation = np.broadcast_to(np.eye(3), (len(table), 3, 3))
     for i, axis in enumerate("xyz"):
         vector = np.zeros((len(table), 3))
-        vector[:, i] = _measured(columns, f"r{axis}", ANGLES)
+        vector[:, i] = _column_in_base_unit(columns, f"r{axis}", ANGLES)
         rotation = se3.rotation_exp(torch.from_numpy(vector)).numpy() @ rotation
-    return OuterPath("csv", np.concatenate([rotation, place[..., None]], -1), times_us)
+    return ExternalPath("csv", np.concatenate([rotation, position[..., None]], -1), times_us)
 
 
-def _measured(
+def _column_in_base_unit(
     columns: dict[str, np.ndarray], axis: str, units: dict[str, float]
 ) -> Float64[np.ndarray, "p"]:
-    """A column in its base unit; zeros if there is none."""
+    """The column of an axis in its base unit; zeros if there is none."""
     for unit, factor in units.items():
         if f"{axis}_{unit}" in columns:
             return columns[f"{axis}_{unit}"] * factor
@@ -233,7 +234,7 @@ def _measured(
 
 
 def _orthonormal(poses: Float64[np.ndarray, "p 3 4"]) -> Float64[np.ndarray, "p 3 4"]:
-    """The nearest rotations: files round to six digits. Anything farther off is left to fail."""
+    """Poses with the nearest rotations, as files round to six digits; others stay to be refused."""
     u, singular, vt = np.linalg.svd(poses[:, :, :3])
     near = (np.abs(singular - 1).max(-1) < UNIT_LENGTH)[:, None, None]
     rotation = np.where(near, u @ vt, poses[:, :, :3])

@@ -14,7 +14,7 @@ import numpy as np
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_file import read_poses
-from sharpfield.core.capture import HELD_BACK_US, Capture, Clock, Known, Note, Split
+from sharpfield.core.capture import POSE_TOLERANCE_US, Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import write_json
@@ -291,8 +291,8 @@ class _Ingest:
         posed = np.ones(len(exposure), bool)
         if self._options.scene.poses is not None:
             times_us, _ = read_poses(self._options.scene.poses)
-            posed = (exposure.open_us >= times_us[0] - HELD_BACK_US) & (
-                exposure.close_us <= times_us[-1] + HELD_BACK_US
+            posed = (exposure.open_us >= times_us[0] - POSE_TOLERANCE_US) & (
+                exposure.close_us <= times_us[-1] + POSE_TOLERANCE_US
             )
         keep = inside & posed
         if not keep.any():

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64, Int64
 
 from sharpfield.captures.layouts._photos import depth_bounds, fitted, same_camera
-from sharpfield.captures.paths.pose_layouts import OuterPath
+from sharpfield.captures.paths.pose_layouts import ExternalPath
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3
@@ -50,7 +50,7 @@ class Attached:
 
 
 def attach(
-    capture: Capture, path: OuterPath, mount: Mount, *, bounds: tuple[float, float] | None = None
+    capture: Capture, path: ExternalPath, mount: Mount, *, bounds: tuple[float, float] | None = None
 ) -> Attached:
     """The capture with the poses of a file.
 
@@ -94,7 +94,7 @@ def attach(
     return Attached(made, laid.kept, laid.path.known_us(0))
 
 
-def known_at(path: OuterPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> Known:
+def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> Known:
     """Poses of the camera at some times of the capture; NaN where the file does not reach.
 
     Raises:
@@ -119,7 +119,7 @@ def _mounted(poses: Float64[np.ndarray, "p 3 4"], mount: Mount) -> Float64[np.nd
 
 
 def _timed(
-    capture: Capture, path: OuterPath, poses: Float64[np.ndarray, "p 3 4"], mount: Mount
+    capture: Capture, path: ExternalPath, poses: Float64[np.ndarray, "p 3 4"], mount: Mount
 ) -> Laid:
     """Everything that the path covers; there must be one camera."""
     assert path.times_us is not None, "the caller looked"
@@ -168,7 +168,7 @@ def _expect_some(capture: Capture, stamps: Int64[np.ndarray, "p"], covered: int)
 
 
 def _by_frame(
-    capture: Capture, path: OuterPath, poses: Float64[np.ndarray, "p 3 4"]
+    capture: Capture, path: ExternalPath, poses: Float64[np.ndarray, "p 3 4"]
 ) -> tuple[Int64[np.ndarray, "n"], Float64[np.ndarray, "n 3 4"]]:
     """Which frames poses without times belong to: by name, or one for each in order."""
     frames = capture.needed_frames
@@ -194,7 +194,7 @@ def _by_frame(
     return frame, poses[row]
 
 
-def _with_model(capture: Capture, path: OuterPath) -> Capture:
+def _with_model(capture: Capture, path: ExternalPath) -> Capture:
     """Points, depth bounds and, where it is unknown, the lens of a reconstruction."""
     model = path.model
     if model is None or not len(model.points):

@@ -49,5 +49,5 @@ def merge(models: Sequence[object], blocks: Sequence[Block]) -> SplatModel:
 def _inside(model: SplatModel, gaussians: Gaussians, block: Block) -> dict[str, Tensor]:
     """The parameters of the Gaussians whose means lie in a block."""
     means = model.change.inverse().points(gaussians.means.detach().cpu().double().numpy())
-    inside = torch.from_numpy(block.holds(means)).to(gaussians.means.device)
+    inside = torch.from_numpy(block.contains(means)).to(gaussians.means.device)
     return {name: tensor.detach()[inside] for name, tensor in gaussians.points().items()}
