@@ -285,7 +285,7 @@ def test_a_track_without_poses_is_refused(panning, tmp_path):
     native.write(variations(panning)["a rig"], tmp_path)
     path = tmp_path / "capture.toml"
     path.write_text(path.read_text().replace("track = 4", "track = 5"))
-    with pytest.raises(CaptureError, match="of a track that has no poses") as caught:
+    with pytest.raises(CaptureError, match="belongs to a track without poses") as caught:
         native.read(tmp_path)
     assert "tracks 0 to 5, 5 with poses" in str(caught.value)
 
