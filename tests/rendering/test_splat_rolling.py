@@ -90,3 +90,18 @@ def test_poses_of_all_rows_learn():
     seen = shift(means, start)
     assert seen[0, :2].abs().min() > 0.05 and not seen[0, 2].any(), "nothing is behind the camera"
     assert torch.autograd.gradcheck(shift, (means.requires_grad_(), start.requires_grad_()))
+
+
+def test_a_drift_of_the_scene_is_like_the_opposite_drift_of_the_camera():
+    """Law: only the motion of one against the other is seen."""
+    made = torch.Generator().manual_seed(1)
+    means = torch.randn(40, 3, generator=made) * 0.5 + torch.tensor([0.0, 0.0, 3.0])
+    drift = torch.tensor([0.4, -0.3, 0.2])
+    still = torch.eye(4)[:3].expand(1, 5, 3, 4)
+    moved = still.clone()
+    moved[0, :, :, 3] = -torch.linspace(-0.5, 0.5, 5)[:, None] * drift
+    pose = still[:, 2]
+    by_scene = row_shift(means, pose, still, IDEAL, IDEAL, drift.expand(40, 3))
+    by_camera = row_shift(means, pose, moved, IDEAL, IDEAL)
+    torch.testing.assert_close(by_scene, by_camera, atol=1e-4, rtol=0)
+    assert by_scene.abs().max() > 1
