@@ -46,7 +46,7 @@ STAGES = {
     "fit": ("sharpfield.training.session", "fit"),
     "step": ("sharpfield.training.loop", "accumulate"),
     "grow": ("sharpfield.recipes.points.model", "missing_points"),
-    "save": ("sharpfield.training.record", "save_last"),
+    "save": ("sharpfield.training.status", "save_last"),
     "load": ("sharpfield.training.session", "recover"),
 }
 """Functions whose times are taken, and where they are looked up."""

@@ -30,7 +30,7 @@ from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
 from sharpfield.simulation.static_capture import Rig, simulate
-from sharpfield.training.memory import available_bytes, kept_bytes
+from sharpfield.training.memory import available_bytes, saved_bytes
 from sharpfield.training.optim import adam
 
 ATELIER = Path(__file__).parents[1].parent / "shared" / "data" / "blender" / "atelier"
@@ -128,7 +128,7 @@ def measure(task: Task) -> Measured | None:
     seconds: list[float] = []
     losses: list[dict[str, float]] = []
     try:
-        kept = kept_bytes(model, model.draw(step), step)  # also compiles
+        kept = saved_bytes(model, model.draw(step), step)  # also compiles
         Path("/proc/self/clear_refs").write_text("5")  # forgets the peak so far
         for _ in range(task.runs):
             start = clock()

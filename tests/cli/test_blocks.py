@@ -13,7 +13,7 @@ import pytest
 from sharpfield.captures.native.layout import write
 from sharpfield.runs.run import open_run
 from sharpfield.training.checkpoint import file_of
-from sharpfield.training.record import read_ledger
+from sharpfield.training.status import read_status
 from tests.captures.test_blocks import corridor
 from tests.cli.command import run
 
@@ -46,7 +46,7 @@ def test_blocks_become_one_run_of_what_lies_in_each(alone: Path):
     found = len(whole.model.scene.static)
     assert 0 < found < sum(len(part.scene.static) for part in parts)
     assert whole.config.block == "" and len(whole.capture.split.train) == 32
-    assert read_ledger(alone).finished
+    assert read_status(alone).finished
 
 
 def test_a_finished_command_does_nothing_again(capture: Path, alone: Path):

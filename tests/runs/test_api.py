@@ -115,7 +115,7 @@ def test_training_goes_on_where_it_stopped(capture: sf.Capture, tmp_path: Path) 
     assert not (out / "capture").exists()
     assert first.config.capture == str((tmp_path / "capture").resolve())
     again = sf.train("ev-splat", tmp_path / "capture", out=out, steps=5, device="cpu", resume=True)
-    assert again.ledger.steps == 5
+    assert again.status.steps == 5
 
 
 def test_evaluating_writes_metrics_and_a_report(run: sf.Run) -> None:

@@ -43,7 +43,11 @@ def test_what_is_saved_comes_back(tmp_path: Path, trained):
     save_last(tmp_path, *trained, Progress(12, 20, 3, best=1 / 3, settings=SETTINGS))
     saved = load(file_of(tmp_path, "last"))
     assert saved.progress.settings == {"recipe": "toy", "samples": [64, 128]}
-    assert (saved.progress.step, saved.progress.planned_steps, saved.progress.parts) == (12, 20, 3)
+    assert (saved.progress.step, saved.progress.planned_steps, saved.progress.micro_batches) == (
+        12,
+        20,
+        3,
+    )
     assert saved.progress.best == 1 / 3
 
     other = Toy(20)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from sharpfield.core.errors import RunError
-from sharpfield.training.hooks import describe, every, every_seconds, finite
+from sharpfield.training.hooks import describe, every, every_seconds, require_finite
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy
@@ -35,7 +35,7 @@ def test_every_so_many_seconds():
 
 def test_finite_losses_pass():
     model = Toy(1)
-    finite(3, model, adam(model), {"a": torch.tensor(1e30), "b": torch.tensor(-2.0)})
+    require_finite(3, model, adam(model), {"a": torch.tensor(1e30), "b": torch.tensor(-2.0)})
 
 
 @pytest.mark.parametrize("ill", ["nan", "inf", "-inf"])
@@ -43,7 +43,7 @@ def test_a_loss_that_is_not_finite_is_named_with_step_and_batch(ill: str):
     losses = {"blur": torch.tensor(0.25), "events": torch.tensor(float(ill))}
     model = Toy(1, measurements=3)
     with pytest.raises(RunError) as error:
-        finite(41, model, adam(model), losses)
+        require_finite(41, model, adam(model), losses)
     what, where, got, do = str(error.value).splitlines()
     assert what == "RunError: the loss 'events' is not finite"
     assert where.startswith("  where  step 41; batch: frames (3 Pixels): xy 0.")
@@ -66,4 +66,4 @@ def test_the_guard_ends_training_at_the_step():
         "odd": model.net[0].weight.sum() * (float("inf") if step == 2 else 1.0)
     }
     with pytest.raises(RunError, match="step 2; batch"):
-        fit(model, adam(model), steps=range(9), hooks=[finite])
+        fit(model, adam(model), steps=range(9), hooks=[require_finite])

@@ -7,9 +7,9 @@ from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 
 
-def trained(steps: range, *, parts: int = 1) -> Toy:
+def trained(steps: range, *, micro_batches: int = 1) -> Toy:
     model = Toy(20)
-    fit(model, adam(model), steps=steps, parts=parts)
+    fit(model, adam(model), steps=steps, micro_batches=micro_batches)
     return model
 
 
@@ -34,8 +34,8 @@ def test_two_calls_equal_one():
 
 
 def test_parts_train_as_the_whole_does():
-    whole, parts = trained(range(12)), trained(range(12), parts=4)
-    for a, b in zip(whole.parameters(), parts.parameters(), strict=True):
+    whole, micro_batches = trained(range(12)), trained(range(12), micro_batches=4)
+    for a, b in zip(whole.parameters(), micro_batches.parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-6)
 
 

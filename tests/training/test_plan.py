@@ -3,7 +3,7 @@ import torch
 
 from sharpfield.core.errors import OptionError
 from sharpfield.training.options import Options
-from sharpfield.training.plan import SLACK, Plan, affordable_steps, make_plan
+from sharpfield.training.plan import TIME_FRACTION, Plan, affordable_steps, make_plan
 from tests.training.toy import Toy
 
 
@@ -16,8 +16,10 @@ def test_the_recipe_gives_the_length_unless_told_otherwise():
 
 def test_minutes_are_filled_with_steps():
     # A step takes 10 ms and a little; 1 s of them, of which the trials take five.
-    steps = affordable_steps(Toy(100, seconds_per_step=0.01), seconds=1.0, schedule=100, parts=1)
-    assert 10 <= steps <= SLACK * 95
+    steps = affordable_steps(
+        Toy(100, seconds_per_step=0.01), seconds=1.0, schedule=100, micro_batches=1
+    )
+    assert 10 <= steps <= TIME_FRACTION * 95
 
 
 def test_the_schedule_is_made_for_the_steps_that_fit():
@@ -35,13 +37,13 @@ def test_the_schedule_is_made_for_the_steps_that_fit():
 
 
 def test_no_time_is_still_one_step():
-    assert affordable_steps(Toy(10), seconds=0.0, schedule=10, parts=1) == 1
+    assert affordable_steps(Toy(10), seconds=0.0, schedule=10, micro_batches=1) == 1
 
 
 def test_a_small_budget_splits_the_batch():
     wide = lambda steps: Toy(steps, measurements=4096)  # noqa: E731
     plan, _ = make_plan(wide, Options(memory_gb=0.0004), steps=5, seconds=0.0)
-    assert plan.parts > 1 and 4096 % plan.parts == 0
+    assert plan.micro_batches > 1 and 4096 % plan.micro_batches == 0
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from torch import nn
 
 from sharpfield.core.points import Growth
 from sharpfield.ops.sparse_rows import take_rows
-from sharpfield.training.optim import TAKEN, RowAdam
-from sharpfield.training.surgery import rebuild
+from sharpfield.training.optim import ROW_STEPS, RowAdam
+from sharpfield.training.point_growth import apply_growth
 
 
 def slopes(step: int) -> torch.Tensor:
@@ -74,9 +74,9 @@ def test_counts_follow_their_rows_when_points_grow():
         take_rows(table.values, taken(step)).sum().backward()
         optimizer.step()
     source = torch.tensor([2, 3, 2])
-    rebuild(table, optimizer, Growth(source, torch.tensor([False, False, True])))
-    assert optimizer.state[table.values][TAKEN].tolist() == [2, 1, 0]
+    apply_growth(table, optimizer, Growth(source, torch.tensor([False, False, True])))
+    assert optimizer.state[table.values][ROW_STEPS].tolist() == [2, 1, 0]
     optimizer.zero_grad(set_to_none=True)
     take_rows(table.values, torch.tensor([0, 2])).sum().backward()
     optimizer.step()
-    assert optimizer.state[table.values][TAKEN].tolist() == [3, 1, 1]
+    assert optimizer.state[table.values][ROW_STEPS].tolist() == [3, 1, 1]

@@ -15,15 +15,17 @@ from rich.console import Console
 from sharpfield.core.errors import RunError
 from sharpfield.training.checkpoint import file_of, load
 from sharpfield.training.options import Options
-from sharpfield.training.record import Ledger, read_ledger
 from sharpfield.training.session import train
+from sharpfield.training.status import TrainingStatus, read_status
 from tests.training import toy
 from tests.training.toy import Toy, quiet, score
 
 SETTINGS = {"recipe": "toy", "seed": 0}
 
 
-def run_toy(run: Path, options: Options, *, build=Toy, validate=None, console=None) -> Ledger:
+def run_toy(
+    run: Path, options: Options, *, build=Toy, validate=None, console=None
+) -> TrainingStatus:
     return train(
         build,
         run,
@@ -71,10 +73,15 @@ def test_a_run_leaves_its_folder_in_order(straight: Path):
         "tensorboard",
         "training.json",
     ]
-    ledger = read_ledger(straight)
-    assert ledger is not None and ledger.finished
-    assert (ledger.steps, ledger.planned_steps, ledger.parts, ledger.device) == (30, 30, 1, "cpu")
-    assert ledger.seconds > 0 and ledger.peak_memory_mb > 50
+    status = read_status(straight)
+    assert status is not None and status.finished
+    assert (status.steps, status.planned_steps, status.micro_batches, status.device) == (
+        30,
+        30,
+        1,
+        "cpu",
+    )
+    assert status.seconds > 0 and status.peak_memory_mb > 50
     assert load(file_of(straight, "last")).progress.step == 30
     assert load(file_of(straight, "previous")).progress.step == 28
 
@@ -94,7 +101,7 @@ def test_parts_are_remembered(tmp_path: Path):
     options = Options(memory_gb=0.0004, checkpoint_every=7)
     wide = lambda steps: Toy(steps, measurements=4096)  # noqa: E731
     whole = run_toy(tmp_path / "a", options, build=wide)
-    assert whole.parts > 1
+    assert whole.micro_batches > 1
 
     class Dying(Toy):
         def draw(self, step):
@@ -105,7 +112,7 @@ def test_parts_are_remembered(tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         run_toy(tmp_path / "b", options, build=lambda steps: Dying(steps, measurements=4096))
     resumed = run_toy(tmp_path / "b", Options(resume=True), build=wide)
-    assert resumed.parts == whole.parts
+    assert resumed.micro_batches == whole.micro_batches
     assert last_bytes(tmp_path / "a") == last_bytes(tmp_path / "b")
 
 
@@ -122,13 +129,13 @@ def test_the_best_is_kept_and_scores_are_logged(straight: Path):
 def test_minutes_end_with_a_finished_schedule(tmp_path: Path):
     slow = lambda steps: Toy(steps, seconds_per_step=0.005)  # noqa: E731
     begun = time.monotonic()
-    ledger = run_toy(tmp_path, Options(minutes=0.03), build=slow)
+    status = run_toy(tmp_path, Options(minutes=0.03), build=slow)
     assert time.monotonic() - begun < 3.5
-    assert 30 < ledger.planned_steps < 360  # not the recipe's 30; 1.8 s of 5 ms and more
-    assert ledger.steps > 0.5 * ledger.planned_steps
-    if not ledger.finished:  # on a machine that grew slower on the way
+    assert 30 < status.planned_steps < 360  # not the recipe's 30; 1.8 s of 5 ms and more
+    assert status.steps > 0.5 * status.planned_steps
+    if not status.finished:  # on a machine that grew slower on the way
         assert run_toy(tmp_path, Options(minutes=0.5, resume=True)).finished
-    assert load(file_of(tmp_path, "last")).progress.planned_steps == ledger.planned_steps
+    assert load(file_of(tmp_path, "last")).progress.planned_steps == status.planned_steps
 
 
 def test_time_that_is_up_stops_politely(tmp_path: Path, straight: Path):
@@ -152,7 +159,7 @@ def test_time_that_is_up_stops_politely(tmp_path: Path, straight: Path):
 def test_seconds_add_up_over_sessions(tmp_path: Path):
     slow = lambda steps: Toy(steps, seconds_per_step=0.02)  # noqa: E731
     run_toy(tmp_path, Options(steps=5), build=slow)
-    first = read_ledger(tmp_path)
+    first = read_status(tmp_path)
     second = run_toy(tmp_path, Options(steps=10, resume=True), build=slow)
     assert first is not None and second.seconds >= first.seconds + 0.1
     assert second.steps == second.planned_steps == 10
@@ -194,10 +201,10 @@ def test_other_settings_are_refused(straight: Path):
         train(Toy, straight, Options(resume=True), steps=30, settings=SETTINGS | {"seed": 1})
 
 
-def test_a_damaged_ledger_is_named(tmp_path: Path):
+def test_a_damaged_status_is_named(tmp_path: Path):
     run_toy(tmp_path, Options(steps=2))
     (tmp_path / "training.json").write_text('{"steps": ')
-    with pytest.raises(RunError, match="the record of the training cannot be read"):
+    with pytest.raises(RunError, match="the status of the training cannot be read"):
         run_toy(tmp_path, Options(resume=True))
 
 
@@ -210,8 +217,8 @@ def start_process(run: Path, *more: str, steps: int = 30) -> subprocess.Popen:
 def wait_for(process: subprocess.Popen, run: Path, step: int) -> None:
     """Until the process has saved so many steps."""
     for _ in range(4000):
-        ledger = run / "training.json"
-        if ledger.exists() and json.loads(ledger.read_text())["steps"] >= step:
+        status = run / "training.json"
+        if status.exists() and json.loads(status.read_text())["steps"] >= step:
             return
         assert process.poll() is None, process.stdout.read()
         time.sleep(0.005)
@@ -226,8 +233,8 @@ def test_killed_and_resumed_equals_never_having_stopped(tmp_path: Path, straight
         assert process.wait() == -signal.SIGKILL
         process.stdout.close()
         load(file_of(tmp_path, "last"))  # whole, whenever the kill came
-    ledger = run_toy(tmp_path, Options(resume=True))
-    assert ledger.finished
+    status = run_toy(tmp_path, Options(resume=True))
+    assert status.finished
     here, there = (load(file_of(run, "last")).tensors for run in (tmp_path, straight))
     assert here.keys() == there.keys()
     assert all(torch.equal(here[name], there[name]) for name in here)

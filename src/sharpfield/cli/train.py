@@ -73,5 +73,5 @@ def train_command(
         recipe, made, where_from, selection.seed, selection.use, reading, selection.block
     )
     trained = start(started, source, out, training, device=where, console=console)
-    if trained.ledger.finished:
+    if trained.status.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")

@@ -16,7 +16,7 @@ from sharpfield.runs.start import start
 from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
 from sharpfield.training.optim import adam
 from sharpfield.training.options import Options
-from sharpfield.training.record import Ledger, read_ledger, write_ledger
+from sharpfield.training.status import TrainingStatus, read_status, write_status
 
 FOLDER = "blocks"
 """Folder of the runs of blocks, within the run they are merged into."""
@@ -69,51 +69,51 @@ def train_blocks(
     """
     console, folders, configs = console or Console(), runs.folders(), runs.configs()
     for folder, block in zip(folders, configs, strict=True):
-        if read_ledger(folder) is not None:  # finished ones are not opened again
+        if read_status(folder) is not None:  # finished ones are not opened again
             check_settings(read_run_config(folder).settings(), block.settings())
     for i in range(runs.count) if own is None else own:
-        block, done = configs[i], read_ledger(folders[i])
+        block, done = configs[i], read_status(folders[i])
         if done is not None and done.finished:
             continue
         console.print(f"Block {block.block}")
         going_on = replace(options, resume=options.resume or done is not None)
         start(block, capture, folders[i], going_on, device=device, console=console)
-    ledgers = [ledger for folder in folders if (ledger := read_ledger(folder)) is not None]
-    if len(ledgers) < runs.count or not all(ledger.finished for ledger in ledgers):
+    statuses = [status for folder in folders if (status := read_status(folder)) is not None]
+    if len(statuses) < runs.count or not all(status.finished for status in statuses):
         return False
-    together = _together(ledgers)
+    together = _together(statuses)
     if not _up_to_date(runs, together):
         _merge(runs, capture, together)
     return True
 
 
-def _together(ledgers: list[Ledger]) -> Ledger:
+def _together(statuses: list[TrainingStatus]) -> TrainingStatus:
     """What all blocks cost."""
-    steps = max(ledger.planned_steps for ledger in ledgers)
-    return Ledger(
+    steps = max(status.planned_steps for status in statuses)
+    return TrainingStatus(
         planned_steps=steps,
         parts=1,
-        device=ledgers[0].device,
+        device=statuses[0].device,
         steps=steps,
-        seconds=sum(ledger.seconds for ledger in ledgers),
-        peak_memory_mb=max(ledger.peak_memory_mb for ledger in ledgers),
+        seconds=sum(status.seconds for status in statuses),
+        peak_memory_mb=max(status.peak_memory_mb for status in statuses),
     )
 
 
-def _up_to_date(runs: BlockRuns, together: Ledger) -> bool:
+def _up_to_date(runs: BlockRuns, together: TrainingStatus) -> bool:
     """Whether the merged run was made of these blocks, as they are now."""
-    if read_ledger(runs.out) != together:  # written last
+    if read_status(runs.out) != together:  # written last
         return False
     check_settings(read_run_config(runs.out).settings(), runs.whole.settings())
     checkpoints = [file_of(run, "last").stat().st_mtime_ns for run in (runs.out, *runs.folders())]
     return all(block <= checkpoints[0] for block in checkpoints[1:])
 
 
-def _merge(runs: BlockRuns, capture: Capture, together: Ledger) -> None:
+def _merge(runs: BlockRuns, capture: Capture, together: TrainingStatus) -> None:
     """Write the merged run: what all processes that get here write is the same."""
     models = [open_run(run, device="cpu").model for run in runs.folders()]
     merged: Any = merge(models, blocks_of(capture, runs.count))
     write_run_config(runs.out, runs.whole)
     progress = Progress(together.steps, together.steps, settings=runs.whole.settings())
     save_last(runs.out, merged, adam(merged), progress)
-    write_ledger(runs.out, together)
+    write_status(runs.out, together)

@@ -34,7 +34,7 @@ from sharpfield.runs.events import viewpoint as event_viewpoint
 from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.training.checkpoint import file_of, load, restore_weights
-from sharpfield.training.record import Ledger, read_ledger
+from sharpfield.training.status import TrainingStatus, read_status
 from sharpfield.twin.event_twin import TIME_STEPS, TimeSteps
 from sharpfield.twin.options import RECORDED
 
@@ -56,18 +56,18 @@ class Run:
     """All that was read, or its block; also what the model did not use."""
 
     def __repr__(self) -> str:
-        ledger = self.ledger
-        steps = f"{ledger.steps} of {ledger.planned_steps} steps"
+        status = self.status
+        steps = f"{status.steps} of {status.planned_steps} steps"
         return f"Run({str(self.folder)!r}: {self.config.name} on {self.capture.name}, {steps})"
 
     @property
-    def ledger(self) -> Ledger:
+    def status(self) -> TrainingStatus:
         """Steps done and planned, time and memory spent.
 
         Raises:
             RunError: Training has not begun, or its record is damaged.
         """
-        return _needed_ledger(self.folder)
+        return _needed_status(self.folder)
 
     @property
     def seen(self) -> Capture:
@@ -337,9 +337,9 @@ def open_run(folder: Path | str, *, capture: Path | str | None = None, device: s
     """
     folder = Path(folder)
     config = read_run_config(folder)
-    ledger = _needed_ledger(folder)
+    status = _needed_status(folder)
     whole = config.read_capture(folder, None if capture is None else Path(capture))
-    recipe = config.recipe.lasting(ledger.planned_steps)
+    recipe = config.recipe.lasting(status.planned_steps)
     model = recipe.build(used(whole, config.use), config.seed)
     restore_weights(load(file_of(folder, "last")), model)
     return Run(folder, config, model.to(device_named(device)), whole)
@@ -356,8 +356,8 @@ def expect_splat_file(path: Path) -> Path:
     return path
 
 
-def _needed_ledger(folder: Path) -> Ledger:
-    ledger = read_ledger(folder)
-    if ledger is None:
+def _needed_status(folder: Path) -> TrainingStatus:
+    status = read_status(folder)
+    if status is None:
         raise RunError("this run has not begun", where=folder, do="train it first")
-    return ledger
+    return status

@@ -1,4 +1,5 @@
 """Training a model: the loop, its optimizer, hooks, checkpoints, logs and memory plan.
 
-Knows `Model`, knows no recipe. `train` is a whole run in a folder; `fit` is the loop alone.
+Any `Model` can be trained; no recipe is imported here. `session.train` is a whole run in a folder,
+`loop.fit` the loop alone.
 """

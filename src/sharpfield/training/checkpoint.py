@@ -1,4 +1,4 @@
-"""Saved states of a run, from which training goes on as if it had never stopped.
+"""Checkpoints of a run, from which training resumes exactly as if it had never stopped.
 
 A checkpoint is one safetensors file: the model's and the optimizer's tensors, and in the header a
 JSON record with a checksum over everything. Nothing in it can execute code. In
@@ -30,7 +30,7 @@ from sharpfield.core.errors import RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model, PointSet
 from sharpfield.training.optim import module_of
-from sharpfield.training.surgery import repoint, resize
+from sharpfield.training.point_growth import replace_parameters, resize
 
 Settings = dict[str, Any]
 """What a run was started with, as JSON."""
@@ -42,14 +42,14 @@ START_AGAIN = "train again without --resume, into another folder"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run has come."""
+    """How far a run is."""
 
     step: int
-    """Steps done, and so the next one to do."""
+    """Steps done, which is also the index of the next one."""
     planned_steps: int
-    """Length of the whole run; the schedules are made for it."""
-    parts: int = 1
-    """Parts in which each batch is worked off."""
+    """Length of the whole run, and of its schedules."""
+    micro_batches: int = 1
+    """Micro-batches of each step."""
     best: float | None = None
     """Best validation score so far."""
     settings: Settings = field(default_factory=dict)
@@ -58,19 +58,19 @@ class Progress:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A state read back, on the CPU."""
+    """A checkpoint as read, on the CPU."""
 
     progress: Progress
     tensors: dict[str, Tensor]
 
 
 def file_of(run: Path, name: str) -> Path:
-    """Where the checkpoint `last`, `previous` or `best` of a run is."""
+    """Path of the checkpoint `last`, `previous` or `best` of a run."""
     return run / "checkpoints" / f"{name}{SUFFIX}"
 
 
 def save_last(run: Path, model: Model, optimizer: Optimizer, progress: Progress) -> None:
-    """Save everything needed to go on; the checkpoint before this one is kept as `previous`.
+    """Save everything needed to resume; the checkpoint before is kept as `previous`.
 
     Raises:
         RunError: A tensor is not finite; nothing has been written.
@@ -117,13 +117,12 @@ def load(path: Path) -> Checkpoint:
 
 
 def recover(run: Path) -> tuple[Checkpoint | None, str]:
-    """The newest whole checkpoint of a run, left in place as `last`.
+    """The newest complete checkpoint of a run, which becomes `last`.
 
-    What a killed process left half-written is removed.
+    Partial files of a killed process are removed.
 
     Returns:
-        The checkpoint, None if training never got to its first; and a line for the user, empty
-        if nothing was wrong.
+        The checkpoint, None if there is none yet; and a warning, empty if nothing was wrong.
 
     Raises:
         RunError: There are checkpoints, and none can be read.
@@ -155,7 +154,7 @@ def restore(checkpoint: Checkpoint, model: Model, optimizer: Optimizer) -> None:
     built = dict(module_of(model).named_parameters())
     restore_weights(checkpoint, model)
     parameters = dict(module_of(model).named_parameters())
-    repoint(optimizer, {old: parameters[name] for name, old in built.items()})
+    replace_parameters(optimizer, {old: parameters[name] for name, old in built.items()})
     optimizer.state.clear()
     for key, tensor in checkpoint.tensors.items():
         kind, _, rest = key.partition(".")
@@ -177,7 +176,7 @@ def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
         if key.startswith(prefix)
     }
     module = module_of(model)
-    _make_room(saved, module)
+    _resize_points(saved, module)
     state = _state(module)
     wrong = sorted(saved.keys() ^ state.keys()) + [
         f"{name} {list(saved[name].shape)} for {list(tensor.shape)}"
@@ -194,7 +193,7 @@ def restore_weights(checkpoint: Checkpoint, model: Model) -> None:
 
 
 def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on with a run under other settings than it was started with.
+    """Refuse to resume a run with other settings than it was started with.
 
     Raises:
         RunError: Names the settings that differ.
@@ -211,7 +210,7 @@ def check_settings(saved: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 
 
 def _dotted(nested: Mapping[str, Any], before: str = "") -> dict[str, Any]:
-    """Nested settings under dotted names, so that those that differ can be told one by one."""
+    """Nested settings by dotted name, so that differences can be listed one by one."""
     found: dict[str, Any] = {}
     for name, value in nested.items():
         within = isinstance(value, Mapping)
@@ -263,19 +262,19 @@ def _optimizer_tensors(model: Model, optimizer: Optimizer) -> dict[str, Tensor]:
     }
 
 
-def _make_room(saved: Mapping[str, Tensor], module: nn.Module) -> None:
-    """Give each point set the number of points that was saved."""
+def _resize_points(saved: Mapping[str, Tensor], module: nn.Module) -> None:
+    """Resize each point set to the number of points that was saved."""
     for path, part in module.named_modules():
         if isinstance(part, PointSet):
             place = f"{path}." if path else ""
             rows = [saved.get(place + name) for name in part.points()]
             counts = {len(tensor) for tensor in rows if tensor is not None and tensor.ndim}
-            if len(counts) == 1:  # anything else is another model, which the caller notices
+            if len(counts) == 1:  # otherwise the checkpoint is of another model: see the caller
                 resize(part, counts.pop())
 
 
 def _like(parameter: Tensor, saved: Tensor, optimizer: Optimizer) -> Tensor:
-    """A saved moment where, and laid out in memory as, its optimizer expects it."""
+    """A saved moment on the device and in the memory layout that the optimizer expects."""
     if saved.ndim == parameter.ndim and saved.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(saved)
     counted_on_device = optimizer.defaults["fused"] or optimizer.defaults["capturable"]
@@ -292,5 +291,5 @@ def _checksum(tensors: dict[str, Tensor], progress: Mapping[str, Any]) -> str:
 
 
 def _as_json(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """As it will look when read back: tuples become lists."""
+    """As it is read back from JSON: tuples become lists."""
     return json.loads(json.dumps(settings))

@@ -1,4 +1,4 @@
-"""Things that happen between steps: functions `(step, model, optimizer, losses)`."""
+"""Hooks, which are called after each step: functions `(step, model, optimizer, losses)`."""
 
 import dataclasses
 import time
@@ -40,11 +40,11 @@ def every_seconds(
     return sometimes
 
 
-def finite(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
-    """Stop at a loss that is not a finite number.
+def require_finite(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+    """Stop training at a loss that is not finite.
 
     Raises:
-        RunError: Names the loss, the step, and what the batch held.
+        RunError: Names the loss, the step, and the range of each field of the batch.
     """
     values = torch.stack(list(losses.values()))
     if torch.isfinite(values).all():
@@ -61,7 +61,7 @@ def finite(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> Non
 
 
 def describe(batch: Batch) -> str:
-    """What a batch holds, in one line: counts, and the range of each field."""
+    """A batch in one line: counts, and the range of each field."""
     return "; ".join(
         f"{name} ({len(seen)} {type(seen).__name__}): "
         + ", ".join(

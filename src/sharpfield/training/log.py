@@ -1,4 +1,4 @@
-"""What training says while it runs: `log.csv`, TensorBoard if installed, a line or a bar.
+"""Logs of training: `log.csv`, TensorBoard if installed, and a line or a bar on the console.
 
 `log.csv` has one row per logged step: `step` (steps done), `seconds` (spent so far), `total`, then
 one column per loss term and per score, empty where there was none. A term that first appears later
@@ -24,8 +24,8 @@ from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
 from sharpfield.training.memory import Losses
 
-QUIET_SECONDS = 10.0
-"""Where nobody watches (a file, a pipe), one line this often."""
+LINE_SECONDS = 10.0
+"""Seconds between lines where the output is a file or a pipe."""
 
 FIRST_COLUMNS = ["step", "seconds", "total"]
 
@@ -34,7 +34,7 @@ class Table:
     """A CSV file that grows by rows, and by columns when a new name appears."""
 
     def __init__(self, path: Path, *, keep_to: int) -> None:
-        """Open `path`; rows beyond step `keep_to`, of work that was lost, are dropped."""
+        """Open `path`; rows after step `keep_to`, whose steps were lost, are dropped."""
         self.path = path
         self.columns = list(FIRST_COLUMNS)
         rows = []
@@ -46,7 +46,7 @@ class Table:
         self._rewrite(rows)
 
     def append(self, row: Mapping[str, float | int]) -> None:
-        """Add a row; it is on disk when this returns."""
+        """Add a row and write it to disk."""
         new = [name for name in row if name not in self.columns]
         if new:
             with self.path.open(newline="") as file:
@@ -64,7 +64,7 @@ class Table:
 
 
 class Log:
-    """Records losses and scores, and shows how training is getting on."""
+    """Records losses and scores, and shows progress."""
 
     def __init__(
         self, run: Path, *, begin: int, end: int, seconds: float, console: Console
@@ -75,8 +75,8 @@ class Log:
             run: The folder.
             begin: Step this session begins with.
             end: Number of steps of the whole run.
-            seconds: Spent in earlier sessions.
-            console: Where to show progress.
+            seconds: Training time of earlier sessions.
+            console: Where progress is shown.
         """
         self.table = Table(run / "log.csv", keep_to=begin)
         self.board = _tensorboard(run, purge_step=begin)
@@ -95,8 +95,8 @@ class Log:
         self.task = self.bar.add_task(
             "", total=end, completed=begin, width=len(str(end)), speed="", losses=""
         )
-        self.pace = (begin, time.monotonic())
-        self.spoken = time.monotonic()
+        self.last_shown = (begin, time.monotonic())
+        self.printed_at = time.monotonic()
 
     def __enter__(self) -> "Log":
         self.bar.start()
@@ -114,11 +114,11 @@ class Log:
 
     @property
     def seconds(self) -> float:
-        """Spent on the run so far, over all sessions."""
+        """Training time of the run so far, over all sessions."""
         return time.monotonic() - self.begun
 
     def record(self, done: int, values: Mapping[str, float]) -> None:
-        """Write the numbers there are after `done` steps."""
+        """Write values after `done` steps."""
         short = {name: float(f"{value:.6g}") for name, value in values.items()}
         self.table.append({"step": done, "seconds": round(self.seconds, 3), **short})
         if self.board is not None:
@@ -126,24 +126,26 @@ class Log:
                 self.board.add_scalar(name, value, done)
 
     def advance(self, done: int) -> None:
-        """Move the bar, without looking at any number."""
+        """Advance the progress bar; reads no loss, so it does not wait for the device."""
         self.bar.update(self.task, completed=done)
 
     def show(self, done: int, values: Mapping[str, float]) -> None:
-        """Say how far training is, how fast, and what the losses are."""
+        """Show the step, the speed and the losses."""
         now = time.monotonic()
-        speed = (done - self.pace[0]) / max(now - self.pace[1], 1e-9)
-        self.pace = (done, now)
+        speed = (done - self.last_shown[0]) / max(now - self.last_shown[1], 1e-9)
+        self.last_shown = (done, now)
         terms = "  ".join(f"{name} {value:.4g}" for name, value in values.items())
         pace = f"{speed:.1f} steps/s" if speed >= 1 else f"{1 / max(speed, 1e-9):.1f} s/step"
         self.bar.update(self.task, speed=pace, losses=terms)
-        if not self.console.is_terminal and (now - self.spoken > QUIET_SECONDS or done == self.end):
-            self.spoken = now
+        if not self.console.is_terminal and (
+            now - self.printed_at > LINE_SECONDS or done == self.end
+        ):
+            self.printed_at = now
             left = math.ceil((self.end - done) / max(speed, 1e-9))
-            self.say(f"step {done}/{self.end}  {pace}  {left} s left  {terms}")
+            self.print_line(f"step {done}/{self.end}  {pace}  {left} s left  {terms}")
 
-    def say(self, line: str) -> None:
-        """Print one line, above the bar if there is one."""
+    def print_line(self, line: str) -> None:
+        """Print a line, above the progress bar if there is one."""
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -156,7 +158,7 @@ class LogLosses:
         self.counts: dict[str, int] = {}
 
     def __call__(self, step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
-        """Add the losses up, without waiting for the device; log when the time has come."""
+        """Accumulate the losses on the device; every `every` steps, log their means."""
         self.log.advance(step + 1)
         for name, loss in losses.items():
             self.sums[name] = self.sums[name] + loss if name in self.sums else loss
@@ -174,7 +176,7 @@ class LogLosses:
 
 
 def _is_whole(row: Mapping[str | None, Any]) -> bool:
-    """Whether a row was written to its end; a killed process may leave a torn one."""
+    """Whether a row is complete; a killed process may leave a partial one."""
     return None not in row and None not in row.values() and (row["step"] or "").isdigit()
 
 

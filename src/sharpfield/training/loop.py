@@ -1,7 +1,8 @@
-"""The training loop, short enough to read aloud.
+"""The training loop.
 
-A *hook* is called after every step; logs, checkpoints and the guard against losses that are not
-finite are hooks. A *part* is a share of a step's batch that fits in memory (`memory.py`).
+A *hook* is called after every step: logs, checkpoints and the check that losses are finite are
+hooks. A *micro-batch* is a share of a step's batch that fits in memory; gradients accumulate over
+the micro-batches of a step (`memory.py`).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -11,7 +12,7 @@ from torch.optim import Optimizer
 from sharpfield.core.protocols import Growing, Model
 from sharpfield.training.memory import Losses, accumulate
 from sharpfield.training.optim import set_rates
-from sharpfield.training.surgery import rebuild
+from sharpfield.training.point_growth import apply_growth
 
 Hook = Callable[[int, Model, Optimizer, Losses], None]
 """Called with the step just done, the model, the optimizer and the detached loss terms."""
@@ -22,24 +23,24 @@ def fit(
     optimizer: Optimizer,
     *,
     steps: Iterable[int],
-    parts: int = 1,
+    micro_batches: int = 1,
     hooks: Sequence[Hook] = (),
 ) -> None:
-    """Run `steps`. To resume, begin at the saved step: a draw depends on its step alone.
+    """Train for some steps. To resume, begin at the saved step: a batch depends on its step alone.
 
     Args:
-        model: What is trained.
+        model: To be trained.
         optimizer: Of `optim.adam`.
-        steps: Usually a range; whatever ends it early ends training between two steps.
-        parts: Shares in which each batch is worked off; their gradients add up.
+        steps: Usually a range; an iterator that ends early ends training between two steps.
+        micro_batches: In how many micro-batches each batch is split; their gradients add up.
         hooks: Called in this order after each step.
     """
     for step in steps:
         set_rates(optimizer, model.groups(), step)
         optimizer.zero_grad(set_to_none=True)
-        losses = accumulate(model, model.draw(step), step, parts=parts)
+        losses = accumulate(model, model.draw(step), step, micro_batches=micro_batches)
         optimizer.step()
         for part, growth in model.grow(step) if isinstance(model, Growing) else ():
-            rebuild(part, optimizer, growth)
+            apply_growth(part, optimizer, growth)
         for hook in hooks:
             hook(step, model, optimizer, losses)

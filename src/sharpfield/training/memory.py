@@ -1,9 +1,9 @@
-"""How much memory a step needs, and working a batch off in parts that fit.
+"""How much memory a training step needs, and gradient accumulation over micro-batches that fit.
 
-What fills the memory in training are the tensors kept for the backward pass. They are counted on
-small slices of the batch of the most expensive step of the whole schedule, extrapolated to the
-full batch, and the batch is split into as many *parts* as the budget asks for. The losses are
-means over the batch, so the gradient of the whole is the mean of the gradients of equal parts.
+Most of the memory in training holds tensors saved for the backward pass. Their bytes are measured
+on small fractions of the batch of the heaviest step of the schedule and extrapolated to the full
+batch, which is then split into as many micro-batches as the budget requires. Losses are means over
+the batch, so the gradient of the batch is the mean of the gradients of equal micro-batches.
 """
 
 import math
@@ -22,52 +22,53 @@ from sharpfield.core.measurements import Batch
 from sharpfield.core.protocols import Model
 from sharpfield.training.optim import module_of
 
-SHARE = 0.7
-"""Part of the available memory that training may take."""
-TRANSIENT = 1.6
-"""Peak over kept bytes: what is held only for a moment comes on top (1.5 with Ev-DeblurNeRF)."""
-SLICES = (16, 8)
-"""The kept bytes are measured on this fraction of a batch."""
+MEMORY_FRACTION = 0.7
+"""Fraction of the available memory that training may use."""
+PEAK_FACTOR = 1.6
+"""Peak memory over saved bytes; temporaries come on top (1.5 with Ev-DeblurNeRF)."""
+PROBE_FRACTIONS = (16, 8)
+"""Saved bytes are measured on 1/16 and 1/8 of a batch."""
 COPIES = 3
-"""Per parameter, besides itself: its gradient and Adam's two moments."""
+"""Tensors per parameter besides itself: its gradient and Adam's two moments."""
 GIB = 1024**3
 
 Losses = dict[str, Float[Tensor, ""]]
-"""The terms of a step by name; what is minimised is their sum."""
+"""Loss terms of a step by name; their sum is minimised."""
 
 
-def accumulate(model: Model, batch: Batch, step: int, *, parts: int) -> Losses:
-    """Add the gradients of the batch's losses to the parameters, part by part.
+def accumulate(model: Model, batch: Batch, step: int, *, micro_batches: int) -> Losses:
+    """Add the gradients of the batch's losses to the parameters, micro-batch by micro-batch.
 
     Returns:
         The detached loss terms of the whole batch.
     """
     whole: Losses = {}
-    for part, share in split(batch, parts):
-        losses = {name: share * loss for name, loss in model.losses(part, step).items()}
+    for micro_batch, share in split_batch(batch, micro_batches):
+        terms = model.losses(micro_batch, step)
+        losses = {name: share * loss for name, loss in terms.items()}
         torch.stack(list(losses.values())).sum().backward()
         for name, loss in losses.items():
             whole[name] = whole[name] + loss.detach() if name in whole else loss.detach()
     return whole
 
 
-def split(batch: Batch, parts: int) -> Iterator[tuple[Batch, float]]:
-    """Cut every entry of a batch into `parts` consecutive slices.
+def split_batch(batch: Batch, micro_batches: int) -> Iterator[tuple[Batch, float]]:
+    """Split every entry of a batch into consecutive slices.
 
     Yields:
-        A part, and its share of the batch. The shares add up to one.
+        A micro-batch, and its share of the batch. The shares add up to one.
     """
-    for i in range(parts):
-        part = {name: seen[_slice(len(seen), i, parts)] for name, seen in batch.items()}
+    for i in range(micro_batches):
+        part = {name: seen[_slice(len(seen), i, micro_batches)] for name, seen in batch.items()}
         shares = [len(part[name]) / len(seen) for name, seen in batch.items() if len(seen)]
-        yield part, sum(shares) / len(shares) if shares else 1 / parts
+        yield part, sum(shares) / len(shares) if shares else 1 / micro_batches
 
 
-def plan_parts(model: Model, *, budget_bytes: int) -> int:
-    """In how many parts each batch has to be worked off to stay within a budget.
+def plan_micro_batches(model: Model, *, budget_bytes: int) -> int:
+    """Number of micro-batches with which a step stays within a memory budget.
 
     Raises:
-        OptionError: It does not fit, however finely it is split.
+        OptionError: The step does not fit, however finely its batch is split.
     """
     step = model.heaviest_step
     batch = model.draw(step)
@@ -77,12 +78,12 @@ def plan_parts(model: Model, *, budget_bytes: int) -> int:
         for parameter in module_of(model).parameters()
         if parameter.requires_grad
     )
-    free = budget_bytes - COPIES * parameters - TRANSIENT * fixed
+    free = budget_bytes - COPIES * parameters - PEAK_FACTOR * fixed
     lengths = [len(seen) for seen in batch.values() if len(seen)]
-    most = min(lengths)  # no part may be without measurements: their mean would not exist
-    smallest = math.ceil(TRANSIENT * growing / free) if free > 0 else most + 1
+    most = min(lengths)  # an empty micro-batch has no mean
+    smallest = math.ceil(PEAK_FACTOR * growing / free) if free > 0 else most + 1
     if smallest > most:
-        needed = COPIES * parameters + TRANSIENT * (fixed + growing / most)
+        needed = COPIES * parameters + PEAK_FACTOR * (fixed + growing / most)
         raise OptionError(
             "one training step does not fit in the memory budget, however it is split",
             got=f"a budget of {budget_bytes / GIB:.2f} GiB, at least {needed / GIB:.2f} GiB needed",
@@ -91,26 +92,26 @@ def plan_parts(model: Model, *, budget_bytes: int) -> int:
     return _even(max(smallest, 1), lengths)
 
 
-def kept_bytes(model: Model, batch: Batch, step: int) -> int:
-    """Bytes that the forward pass of `batch` keeps for the backward pass, parameters left out."""
+def saved_bytes(model: Model, batch: Batch, step: int) -> int:
+    """Bytes that the forward pass of a batch saves for the backward pass, without parameters."""
     own = {parameter.untyped_storage().data_ptr() for parameter in module_of(model).parameters()}
-    kept: dict[int, int] = {}
+    saved: dict[int, int] = {}
 
     def note(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
         if storage.data_ptr() not in own:
-            kept[storage.data_ptr()] = storage.nbytes()
+            saved[storage.data_ptr()] = storage.nbytes()
         return tensor
 
     with torch.autograd.graph.saved_tensors_hooks(note, lambda tensor: tensor):
-        losses = model.losses(batch, step)  # alive to the end of the count: no address comes twice
-    total = sum(kept.values())
+        losses = model.losses(batch, step)  # kept alive while counting: no address is used twice
+    total = sum(saved.values())
     del losses
     return total
 
 
 def available_bytes(device: torch.device) -> int:
-    """Memory that a run could still take on a device, right now."""
+    """Memory in bytes that is free on a device now."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2]
@@ -118,14 +119,14 @@ def available_bytes(device: torch.device) -> int:
     if meminfo.exists():
         fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
         limits = [int(fields["MemAvailable"].split()[0]) * 1024]
-    group = Path("/sys/fs/cgroup")  # a container may be granted less than the machine has
+    group = Path("/sys/fs/cgroup")  # a container may have less than the machine
     if (group / "memory.max").exists() and (limit := (group / "memory.max").read_text()) != "max\n":
         limits.append(int(limit) - int((group / "memory.current").read_text()))
     return max(min(limits), 0)
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """Most memory in use so far: of the device if it has its own, else of the process."""
+    """Peak memory so far in MiB: of the device if it has its own, else of the process."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -133,21 +134,25 @@ def peak_memory_mb(device: torch.device) -> float:
 
 
 def _memory_line(model: Model, batch: Batch, step: int) -> tuple[float, float]:
-    """Kept bytes as a line in the fraction of the batch: what is always there, what grows."""
+    """Saved bytes as a line in the fraction of the batch: its offset and slope."""
     small, large = (
-        kept_bytes(model, {name: seen[: -(-len(seen) // s)] for name, seen in batch.items()}, step)
-        for s in SLICES
+        saved_bytes(model, {name: seen[: -(-len(seen) // s)] for name, seen in batch.items()}, step)
+        for s in PROBE_FRACTIONS
     )
-    growing = max(large - small, 0) / (1 / SLICES[1] - 1 / SLICES[0])
-    return max(small - growing / SLICES[0], 0.0), growing
+    growing = max(large - small, 0) / (1 / PROBE_FRACTIONS[1] - 1 / PROBE_FRACTIONS[0])
+    return max(small - growing / PROBE_FRACTIONS[0], 0.0), growing
 
 
-def _slice(length: int, part: int, parts: int) -> slice:
-    return slice(length * part // parts, length * (part + 1) // parts)
+def _slice(length: int, part: int, micro_batches: int) -> slice:
+    return slice(length * part // micro_batches, length * (part + 1) // micro_batches)
 
 
 def _even(smallest: int, lengths: list[int]) -> int:
-    """A number of parts that divides every length, if there is one up to twice the smallest."""
+    """A number that divides every length, if there is one between the smallest and its double."""
     common = math.gcd(*lengths)
-    exact = (parts for parts in range(smallest, 2 * smallest + 1) if common % parts == 0)
+    exact = (
+        micro_batches
+        for micro_batches in range(smallest, 2 * smallest + 1)
+        if common % micro_batches == 0
+    )
     return next(exact, smallest)

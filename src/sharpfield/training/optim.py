@@ -3,15 +3,9 @@
 Source: Kingma and Ba, "Adam: a method for stochastic optimization" (ICLR 2015), with the authors'
 constants.
 
-Adam for tables of which a step touches few rows.
-
-Where a gradient is sparse, each row is treated as if it had an optimizer of its own, which is asked
-only in steps that the row takes part in: its moments, and the correction for their beginning at
-zero, follow its own count of steps. Rows that take no part cost nothing. Dense gradients go to
-PyTorch's Adam, unchanged.
-
-Source: Kingma and Ba, "Adam: a method for stochastic optimization" (ICLR 2015), section 2. Dense
-Adam would go on moving rows that take no part along their momentum.
+Where a gradient is sparse, each row has its own step count: moments and bias correction of a row
+are updated only in steps whose gradient has that row, and other rows cost nothing. (Dense Adam
+would keep moving all rows along their momentum.) Dense gradients go to PyTorch's Adam, unchanged.
 """
 
 import math
@@ -25,51 +19,51 @@ from torch.optim import Adam, Optimizer
 from sharpfield.core.protocols import Model
 from sharpfield.core.schedule import Group
 
-TAKEN = "taken"
-"""The state that counts, for each row, the steps it took part in."""
+ROW_STEPS = "row_steps"
+"""Optimizer state: for each row, the number of steps that updated it."""
 
 
 class RowAdam(Adam):
-    """Adam that leaves rows without a gradient alone, where gradients are sparse."""
+    """Adam that updates only the rows of sparse gradients."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """One step of all parameters that have gradients."""
-        assert closure is None, "losses are worked out before, part by part"
+        """Update all parameters that have gradients."""
+        assert closure is None, "losses are computed before, micro-batch by micro-batch"
         sparse: list[tuple[Tensor, Tensor]] = []
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None and parameter.grad.is_sparse:
                     sparse.append((parameter, parameter.grad))
                     self._move(parameter, parameter.grad.coalesce(), group)
-                    parameter.grad = None  # hidden from Adam, which knows dense ones only
+                    parameter.grad = None  # Adam below takes only dense gradients
         super().step()
         for parameter, gradient in sparse:
             parameter.grad = gradient
 
     def _move(self, parameter: Tensor, gradient: Tensor, group: dict[str, Any]) -> None:
-        """Adam on the rows that the gradient has."""
+        """Adam on the rows of a sparse gradient."""
         state = self.state[parameter]
         if not state:
             state["exp_avg"] = torch.zeros_like(parameter)
             state["exp_avg_sq"] = torch.zeros_like(parameter)
-            state[TAKEN] = torch.zeros(len(parameter), device=parameter.device)
+            state[ROW_STEPS] = torch.zeros(len(parameter), device=parameter.device)
         rows, slope = gradient.indices()[0], gradient.values()
         first, second = group["betas"]
-        taken = state[TAKEN][rows] + 1
+        taken = state[ROW_STEPS][rows] + 1
         mean = first * state["exp_avg"][rows] + (1 - first) * slope
         square = second * state["exp_avg_sq"][rows] + (1 - second) * slope.square()
-        state[TAKEN][rows] = taken
+        state[ROW_STEPS][rows] = taken
         state["exp_avg"][rows] = mean
         state["exp_avg_sq"][rows] = square
         count = taken.view(-1, *[1] * (slope.ndim - 1))
-        mean = mean / _begun(first, count)
-        size = (square / _begun(second, count)).sqrt() + group["eps"]
+        mean = mean / _bias_correction(first, count)
+        size = (square / _bias_correction(second, count)).sqrt() + group["eps"]
         parameter.index_add_(0, rows, mean / size, alpha=-group["lr"])
 
 
-def _begun(decay: float, count: Tensor) -> Tensor:
-    """1 - decay^count: what an average that began at zero holds of what it should."""
+def _bias_correction(decay: float, count: Tensor) -> Tensor:
+    """Bias correction 1 - decay^count of a moment that starts at zero (section 3)."""
     return -torch.expm1(count * math.log(decay))
 
 
@@ -78,25 +72,24 @@ FUSED = ("cpu", "cuda")
 
 
 def module_of(model: Model) -> nn.Module:
-    """The model as the `nn.Module` that every model also is."""
+    """The model as an `nn.Module`, which every model is."""
     assert isinstance(model, nn.Module), f"{type(model).__name__} is not an nn.Module"
     return model
 
 
 def adam(model: Model) -> RowAdam:
-    """Adam over the model's groups, with the rates of step 0.
+    """Adam over the model's parameter groups, with the learning rates of step 0.
 
-    A parameter that wants gradients and belongs to no group would silently never move; that is an
-    error in the model.
+    A trainable parameter in no group would silently never be trained: that is an error.
     """
     groups = model.groups()
     grouped = {id(parameter) for group in groups for parameter in group.parameters}
-    forgotten = [
+    ungrouped = [
         name
         for name, parameter in module_of(model).named_parameters()
         if parameter.requires_grad and id(parameter) not in grouped
     ]
-    assert not forgotten, f"parameters of no group: {', '.join(forgotten)}"
+    assert not ungrouped, f"parameters of no group: {', '.join(ungrouped)}"
     parameters = [parameter for group in groups for parameter in group.parameters]
     fused = all(
         parameter.device.type in FUSED and torch.is_floating_point(parameter)

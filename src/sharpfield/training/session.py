@@ -1,7 +1,4 @@
-"""A whole run: plan it, train, save, log, stop politely, and go on where it stopped.
-
-When to end training early, between two steps: a signal, or time that is up.
-"""
+"""A whole run: plan it, train, save, log, stop at a signal or when time is up, and resume."""
 
 import dataclasses
 import itertools
@@ -19,32 +16,32 @@ from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
 from sharpfield.training.checkpoint import Checkpoint, Progress, check_settings, recover, restore
-from sharpfield.training.hooks import every, every_seconds, finite
+from sharpfield.training.hooks import every, every_seconds, require_finite
 from sharpfield.training.log import Log, LogLosses
 from sharpfield.training.loop import Hook, fit
 from sharpfield.training.optim import adam
 from sharpfield.training.options import Options
 from sharpfield.training.plan import Build, Plan, make_plan
-from sharpfield.training.record import Ledger, Record, read_ledger, write_ledger
+from sharpfield.training.status import Checkpointer, TrainingStatus, read_status, write_status
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
-    """While open, turns the first interrupt into a request to end after the step under way.
+    """While open, the first signal to stop ends training after the current step.
 
-    A second interrupt ends the program at once, as it would without this.
+    A second one ends the program at once.
     """
 
     def __init__(self, *, minutes: float | None = None) -> None:
-        """Allow `minutes` from now; None for as long as it takes."""
+        """Stop after `minutes` from now; None for no limit."""
         self.deadline = None if minutes is None else time.monotonic() + 60 * minutes
         self.interrupted = ""
         self.earlier: dict[int, Any] = {}
 
     def __enter__(self) -> "Stop":
         if threading.current_thread() is threading.main_thread():
-            self.earlier = {number: signal.signal(number, self._note) for number in SIGNALS}
+            self.earlier = {number: signal.signal(number, self._request) for number in SIGNALS}
         return self
 
     def __exit__(
@@ -53,34 +50,34 @@ class Stop:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._give_back()
+        self._restore_handlers()
 
     @property
     def reason(self) -> str:
-        """Why training should end now; empty if it should not."""
+        """Why training should stop now; empty if it should not."""
         if self.interrupted:
             return self.interrupted
         return "the time is up" if self.seconds_left <= 0 else ""
 
     @property
     def seconds_left(self) -> float:
-        """Until the time is up."""
+        """Time left; infinite without a limit."""
         return float("inf") if self.deadline is None else self.deadline - time.monotonic()
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _request(self, number: int, frame: FrameType | None) -> None:
         self.interrupted = f"interrupted by {signal.Signals(number).name}"
-        self._give_back()
+        self._restore_handlers()
 
-    def _give_back(self) -> None:
+    def _restore_handlers(self) -> None:
         for number, handler in self.earlier.items():
             signal.signal(number, handler)
         self.earlier = {}
 
 
 CHECKPOINT_SECONDS = 60.0
-"""Between checkpoints, unless a number of steps is given."""
+"""Time between checkpoints, unless a number of steps is given."""
 GUARD_STEPS = 100
-"""Between looks at the losses on a GPU, which has to be waited for each time."""
+"""Steps between checks of the losses on a GPU, each of which waits for the device."""
 
 
 def train(
@@ -92,7 +89,7 @@ def train(
     settings: Mapping[str, Any],
     validate: Callable[[Model], float] | None = None,
     console: Console | None = None,
-) -> Ledger:
+) -> TrainingStatus:
     """Train a model in a run folder, from the start or from where it stopped.
 
     Args:
@@ -100,56 +97,56 @@ def train(
         run: Folder for `checkpoints/`, `log.csv` and `training.json`.
         options: How to train.
         steps: Length of the recipe's own schedule.
-        settings: What must be the same when resuming, as JSON: recipe, seed, capture; not the
+        settings: Recipe, seed and capture as JSON, which must be the same when resuming; not the
             number of steps.
-        validate: A score of the model, higher is better; the best weights are kept.
-        console: Where to show progress.
+        validate: Scores a model, higher is better; the weights with the best score are kept.
+        console: Where progress is shown.
 
     Returns:
         Length and cost of the run; `finished` tells whether all steps are done.
 
     Raises:
         RunError: The folder holds another run, or a loss is not finite.
-        KeyboardInterrupt: A signal came; everything is saved, and whatever was to follow is not.
+        KeyboardInterrupt: A signal stopped the training; everything is saved.
     """
     console = console or Console()
     with Stop(minutes=options.minutes) as stop:
         saved = _resumed(run, options, settings, console)
         if saved is None:
             plan, model = make_plan(build, options, steps=steps, seconds=stop.seconds_left)
-            begin = Progress(0, plan.steps, plan.parts, settings=dict(settings))
+            begin = Progress(0, plan.steps, plan.micro_batches, settings=dict(settings))
         else:
-            plan = Plan(options.steps or saved.progress.planned_steps, saved.progress.parts)
+            plan = Plan(options.steps or saved.progress.planned_steps, saved.progress.micro_batches)
             model = build(plan.steps)
             begin = dataclasses.replace(saved.progress, planned_steps=plan.steps)
         optimizer = adam(model)
         if saved is not None:
             restore(saved, model, optimizer)
         device = device_of(model)
-        ledger = _ledger(run, plan, begin, device.type)
+        status = _status(run, plan, begin, device.type)
         with Log(
-            run, begin=begin.step, end=plan.steps, seconds=ledger.seconds, console=console
+            run, begin=begin.step, end=plan.steps, seconds=status.seconds, console=console
         ) as log:
-            log.say(_opening(plan, begin.step))
-            record = Record(run, log, ledger, begin)
+            log.print_line(_opening(plan, begin.step))
+            checkpointer = Checkpointer(run, log, status, begin)
             fit(
                 model,
                 optimizer,
                 steps=itertools.takewhile(lambda _: not stop.reason, range(begin.step, plan.steps)),
-                parts=plan.parts,
-                hooks=_hooks(record, options, validate, device=device.type),
+                micro_batches=plan.micro_batches,
+                hooks=_hooks(checkpointer, options, validate, device=device.type),
             )
-            record.flush(model, optimizer)
-    if not record.ledger.finished:
+            checkpointer.flush(model, optimizer)
+    if not checkpointer.status.finished:
         console.print(
-            f"Stopped after step {record.ledger.steps} of {plan.steps}: {stop.reason}."
+            f"Stopped after step {checkpointer.status.steps} of {plan.steps}: {stop.reason}."
             " Saved; the same command with --resume goes on from here.",
             highlight=False,
             soft_wrap=True,
         )
     if stop.interrupted:
         raise KeyboardInterrupt
-    return record.ledger
+    return checkpointer.status
 
 
 def require_unused(run: Path) -> None:
@@ -169,7 +166,7 @@ def require_unused(run: Path) -> None:
 def _resumed(
     run: Path, options: Options, settings: Mapping[str, Any], console: Console
 ) -> Checkpoint | None:
-    """The state to go on from; None for a run that starts at its beginning."""
+    """The checkpoint to resume from; None for a run that starts at step 0."""
     if not options.resume:
         require_unused(run)
         return None
@@ -181,45 +178,47 @@ def _resumed(
     return saved
 
 
-def _ledger(run: Path, plan: Plan, begin: Progress, device: str) -> Ledger:
-    """The ledger at the beginning of a session, also on disk."""
-    earlier = read_ledger(run) if begin.step else None
-    ledger = Ledger(
+def _status(run: Path, plan: Plan, begin: Progress, device: str) -> TrainingStatus:
+    """The status at the beginning of a session, also written to disk."""
+    earlier = read_status(run) if begin.step else None
+    status = TrainingStatus(
         planned_steps=plan.steps,
-        parts=plan.parts,
+        micro_batches=plan.micro_batches,
         device=device,
         steps=begin.step,
         seconds=earlier.seconds if earlier else 0.0,
         peak_memory_mb=earlier.peak_memory_mb if earlier else 0.0,
     )
-    write_ledger(run, ledger)
-    return ledger
+    write_status(run, status)
+    return status
 
 
 def _opening(plan: Plan, step: int) -> str:
-    parts = f", each batch in {plan.parts} parts to fit in memory" if plan.parts > 1 else ""
-    where = f"Resuming at step {step} of {plan.steps}" if step else f"Training {plan.steps} steps"
-    return where + parts
+    """The first line that is printed."""
+    split = f", {plan.micro_batches} micro-batches each" if plan.micro_batches > 1 else ""
+    if step:
+        return f"Resuming at step {step} of {plan.steps}{split}"
+    return f"Training {plan.steps} steps{split}"
 
 
 def _hooks(
-    record: Record,
+    checkpointer: Checkpointer,
     options: Options,
     validate: Callable[[Model], float] | None,
     *,
     device: str,
 ) -> list[Hook]:
-    """In this order: nothing is counted, logged or saved of a step that went wrong."""
+    """In this order, so that a step with a loss that is not finite is never logged or saved."""
     hooks = [
-        every(1 if device == "cpu" else GUARD_STEPS, finite),
-        record.count,
-        LogLosses(record.log, every=options.log_every),
+        every(1 if device == "cpu" else GUARD_STEPS, require_finite),
+        checkpointer.count,
+        LogLosses(checkpointer.log, every=options.log_every),
     ]
     if validate is not None:
-        last = record.progress.planned_steps
-        hooks.append(every(options.validate_every, record.keep_best(validate), last=last))
+        last = checkpointer.progress.planned_steps
+        hooks.append(every(options.validate_every, checkpointer.keep_best(validate), last=last))
     if options.checkpoint_every is None:
-        hooks.append(every_seconds(CHECKPOINT_SECONDS, record.save))
+        hooks.append(every_seconds(CHECKPOINT_SECONDS, checkpointer.save))
     else:
-        hooks.append(every(options.checkpoint_every, record.save))
+        hooks.append(every(options.checkpoint_every, checkpointer.save))
     return hooks

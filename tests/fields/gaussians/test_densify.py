@@ -5,7 +5,7 @@ from sharpfield.core.protocols import PointSet
 from sharpfield.core.seed import generator
 from sharpfield.fields.gaussians.densify import PRUNE_OPACITY, GradientStats, densify, reset_opacity
 from sharpfield.fields.gaussians.static import Gaussians
-from sharpfield.training.surgery import rebuild
+from sharpfield.training.point_growth import apply_growth
 
 SMALL, LARGE, HUGE = 0.005, 0.05, 0.5
 """Scales in a scene of extent 1."""
@@ -97,8 +97,8 @@ def test_statistics_start_again_when_gaussians_grow():
     growth = densified(made, [1.0, 1.0])
     assert growth is not None
     optimizer = torch.optim.Adam(made.parameters())
-    rebuild(made, optimizer, growth)
-    rebuild(stats, optimizer, stats.cleared(growth))
+    apply_growth(made, optimizer, growth)
+    apply_growth(stats, optimizer, stats.cleared(growth))
     assert len(made) == len(stats.mean_grad) == 4 and not stats.mean_grad.any()
     assert set(stats.state_dict()) == {"total", "views"}
     stats.add(torch.ones(1, 4, 2), (2, 2))
@@ -111,7 +111,7 @@ def test_fading_leaves_the_faint_alone_and_their_moments():
     made.opacities.sum().backward()
     optimizer.step()
     growth = reset_opacity(made.opacity_logits)
-    rebuild(made, optimizer, growth)
+    apply_growth(made, optimizer, growth)
     assert made.opacities.tolist() == pytest.approx([0.006, 0.01], rel=2e-2)
     assert (optimizer.state[made.opacity_logits]["exp_avg"] != 0).tolist() == [True, False]
 

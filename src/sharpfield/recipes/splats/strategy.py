@@ -1,7 +1,7 @@
 """How Gaussians grow while they train: by MCMC relocation, or by adaptive density control.
 
 A strategy serves one kind of Gaussians, static or moving. After each step it says what becomes of
-them; `training.surgery` then changes parameters and optimizer alike.
+them; `training.point_growth` then changes parameters and optimizer alike.
 """
 
 from collections.abc import Sequence

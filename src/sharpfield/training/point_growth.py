@@ -1,9 +1,7 @@
-"""Points that grow and die under a running optimizer: the one place that moves its state with them.
+"""Points added, pruned and relocated during training: parameters and optimizer state change alike.
 
-The *moments* of a parameter are what the optimizer remembers of each of its numbers. They follow
-the rows they belong to, and start over at zero for points that are fresh and for numbers that were
-set to something else than their source has. What the optimizer counts for a parameter as a whole
-(its steps) stays.
+Adam's moments follow the rows they belong to. They restart at zero for fresh points and for values
+that differ from their source row. State of a parameter as a whole (its step count) is kept.
 """
 
 from collections.abc import Mapping
@@ -16,14 +14,14 @@ from sharpfield.core.points import Growth
 from sharpfield.core.protocols import PointSet
 
 
-def rebuild(part: PointSet, optimizer: Optimizer, growth: Growth) -> None:
-    """Let the points of a part of a model grow, and the optimizer's moments with them.
+def apply_growth(part: PointSet, optimizer: Optimizer, growth: Growth) -> None:
+    """Replace the points of a module, and the optimizer's parameters and moments with them.
 
     Args:
-        part: Gets new parameters and buffers in place of its present ones.
-        optimizer: Gets the new parameters at the places of the old ones. Parameters it does not
-            have are left to themselves.
-        growth: What the new points are made of.
+        part: Gets new parameters and buffers.
+        optimizer: Gets the new parameters in place of the old ones. Parameters that it does not
+            train are only replaced in `part`.
+        growth: Which rows the new points are copied from.
     """
     old = part.points()
     assert growth.values.keys() <= old.keys(), f"no points named {growth.values.keys() - old}"
@@ -41,30 +39,30 @@ def rebuild(part: PointSet, optimizer: Optimizer, growth: Growth) -> None:
                 moment: _moved(value, parameter, growth, restarted[name])
                 for moment, value in state.items()
             }
-    repoint(optimizer, {old[name]: grown[name] for name in parameters})
+    replace_parameters(optimizer, {old[name]: grown[name] for name in parameters})
 
 
 def resize(part: PointSet, count: int) -> None:
-    """Make room for a number of points; they are all zero, to be loaded."""
+    """Give a module a number of points, all zero, to be loaded."""
     part.replace(
         {name: rows.new_zeros(count, *rows.shape[1:]) for name, rows in part.points().items()}
     )
 
 
-def repoint(optimizer: Optimizer, successors: Mapping[Tensor, Tensor]) -> None:
-    """Put new parameters at the places of old ones in the optimizer's groups."""
+def replace_parameters(optimizer: Optimizer, successors: Mapping[Tensor, Tensor]) -> None:
+    """Replace parameters in the optimizer's groups."""
     for group in optimizer.param_groups:
         group["params"] = [successors.get(old, old) for old in group["params"]]
 
 
 def _restarted(copied: Tensor, new: Tensor, growth: Growth) -> Tensor:
-    """Which numbers of a parameter lose their moments."""
+    """Which values of a parameter restart with moments of zero."""
     fresh = growth.fresh.view(-1, *[1] * (new.ndim - 1))
     return (new != copied) | fresh
 
 
 def _moved(value: Tensor, parameter: Tensor, growth: Growth, restarted: Tensor) -> Tensor:
-    """A moment of the new parameter; what has no rows belongs to the parameter as a whole."""
+    """Optimizer state of the new parameter; state without rows belongs to all of it."""
     if value.shape == parameter.shape:
         return value[growth.source].masked_fill_(restarted, 0)
     if value.shape == parameter.shape[:1]:

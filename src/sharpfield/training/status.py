@@ -1,4 +1,4 @@
-"""Writing down how far a run is and what it has cost: its checkpoints and `training.json`."""
+"""How far a run is and what it has cost: its checkpoints and `training.json`."""
 
 import dataclasses
 import json
@@ -20,20 +20,20 @@ from sharpfield.training.memory import Losses, peak_memory_mb
 
 
 @dataclass(frozen=True)
-class Ledger:
-    """A run's length and its cost so far, as reported in `RUN/training.json`."""
+class TrainingStatus:
+    """Length of a run and its cost so far, as in `RUN/training.json`."""
 
     planned_steps: int
     """Length of the whole run."""
-    parts: int
-    """Parts in which each batch is worked off."""
+    micro_batches: int
+    """Micro-batches of each step."""
     device: str
     steps: int = 0
     """Steps done."""
     seconds: float = 0.0
-    """Spent on them, over all sessions."""
+    """Training time, over all sessions."""
     peak_memory_mb: float = 0.0
-    """Most memory the process used; of the device, if it has its own."""
+    """Peak memory of the process; of the device, if it has its own. In MiB."""
 
     @property
     def finished(self) -> bool:
@@ -41,12 +41,12 @@ class Ledger:
         return self.steps >= self.planned_steps
 
 
-def write_ledger(run: Path, ledger: Ledger) -> None:
+def write_status(run: Path, status: TrainingStatus) -> None:
     """Write `RUN/training.json`."""
-    write_json(run / "training.json", dataclasses.asdict(ledger))
+    write_json(run / "training.json", dataclasses.asdict(status))
 
 
-def read_ledger(run: Path) -> Ledger | None:
+def read_status(run: Path) -> TrainingStatus | None:
     """Read `RUN/training.json`; None if the run has not begun.
 
     Raises:
@@ -56,42 +56,42 @@ def read_ledger(run: Path) -> Ledger | None:
     if not path.is_file():
         return None
     try:
-        return Ledger(**json.loads(path.read_text()))
+        return TrainingStatus(**json.loads(path.read_text()))
     except (ValueError, TypeError) as error:
         raise RunError(
-            "the record of the training cannot be read",
+            "the status of the training cannot be read",
             where=path,
             got=error,
             do="delete it; only the time spent so far is lost",
         ) from None
 
 
-class Record:
-    """Keeps the checkpoints and the ledger of a run; its methods are hooks."""
+class Checkpointer:
+    """Writes the checkpoints and the status of a run; its methods are hooks."""
 
-    def __init__(self, run: Path, log: Log, ledger: Ledger, progress: Progress) -> None:
+    def __init__(self, run: Path, log: Log, status: TrainingStatus, progress: Progress) -> None:
         """Begin a session.
 
         Args:
-            run: The run's folder.
-            log: Knows the time spent; validation scores go there.
-            ledger: Of the sessions before.
+            run: Folder of the run.
+            log: Measures the time; gets validation scores.
+            status: After the sessions before.
             progress: Where this session begins.
         """
-        self.run, self.log, self.ledger, self.progress = run, log, ledger, progress
+        self.run, self.log, self.status, self.progress = run, log, status, progress
         self.unsaved = progress.step == 0
 
     def count(self, step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
-        """Remember that a step is done."""
+        """Note that a step is done."""
         self.progress = dataclasses.replace(self.progress, step=step + 1)
         self.unsaved = True
 
     def save(self, step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
-        """Save everything as it is after the last counted step."""
+        """Save the state after the last counted step."""
         self.flush(model, optimizer)
 
     def keep_best(self, validate: Callable[[Model], float]) -> Hook:
-        """A hook that scores the model, and saves its weights if they are the best so far."""
+        """A hook that scores the model and saves its weights where they are the best so far."""
 
         def score(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
             value, best = validate(model), self.progress.best
@@ -103,15 +103,15 @@ class Record:
         return score
 
     def flush(self, model: Model, optimizer: Optimizer) -> None:
-        """Save what the last checkpoint does not hold yet; first the checkpoint, then its cost."""
+        """Save what the last checkpoint does not hold yet: the checkpoint, then the status."""
         if self.unsaved:
             save_last(self.run, model, optimizer, self.progress)
             self.unsaved = False
-        peak = max(self.ledger.peak_memory_mb, peak_memory_mb(device_of(model)))
-        self.ledger = dataclasses.replace(
-            self.ledger,
+        peak = max(self.status.peak_memory_mb, peak_memory_mb(device_of(model)))
+        self.status = dataclasses.replace(
+            self.status,
             steps=self.progress.step,
             seconds=round(self.log.seconds, 3),
             peak_memory_mb=round(peak, 1),
         )
-        write_ledger(self.run, self.ledger)
+        write_status(self.run, self.status)

@@ -18,8 +18,8 @@ from sharpfield.training.checkpoint import (
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from sharpfield.training.options import Options
+from sharpfield.training.point_growth import apply_growth, resize
 from sharpfield.training.session import train
-from sharpfield.training.surgery import rebuild, resize
 from tests.training.growing import Blobs, GrowingToy
 from tests.training.toy import Toy, quiet
 
@@ -45,7 +45,7 @@ def test_rows_and_their_moments_go_together():
     old = {name: rows.detach().clone() for name, rows in blobs.points().items()}
     before = [m.clone() for m in moments(optimizer, blobs.places)]
     source, fresh = torch.tensor([3, 1, 1]), torch.tensor([False, False, True])
-    rebuild(blobs, optimizer, Growth(source, fresh))
+    apply_growth(blobs, optimizer, Growth(source, fresh))
     assert all(torch.equal(rows, old[name][source]) for name, rows in blobs.points().items())
     first, second, steps = moments(optimizer, blobs.places)
     for now, then in ((first, before[0]), (second, before[1])):
@@ -62,7 +62,7 @@ def test_a_value_that_was_set_loses_its_moments_and_no_other_does():
     places[2, 0] = 9.0
     growth = unchanged(4)
     growth.values["places"] = places
-    rebuild(blobs, optimizer, growth)
+    apply_growth(blobs, optimizer, growth)
     assert torch.equal(blobs.places, places)
     first = moments(optimizer, blobs.places)[0]
     assert first[2, 0] == 0 and before[2, 0] != 0
@@ -75,7 +75,7 @@ def test_the_optimizer_goes_on_with_the_new_parameters():
     blobs = Blobs(4)
     optimizer = pulled_twice(blobs)
     old = list(blobs.parameters())
-    rebuild(blobs, optimizer, Growth(torch.arange(3), torch.zeros(3, dtype=torch.bool)))
+    apply_growth(blobs, optimizer, Growth(torch.arange(3), torch.zeros(3, dtype=torch.bool)))
     assert [id(p) for p in optimizer.param_groups[0]["params"]] == [
         id(p) for p in blobs.parameters()
     ]
@@ -99,7 +99,9 @@ def test_points_learn_alike_whether_others_were_dropped_or_never_there():
             ((blobs.places - 0.3) ** 3).sum().backward()
             optimizer.step()
             if prune and step == 2:
-                rebuild(blobs, optimizer, Growth(keep, torch.zeros(len(keep), dtype=torch.bool)))
+                apply_growth(
+                    blobs, optimizer, Growth(keep, torch.zeros(len(keep), dtype=torch.bool))
+                )
         return blobs.places.detach()
 
     keep = torch.tensor([0, 3, 4, 7])
@@ -109,7 +111,7 @@ def test_points_learn_alike_whether_others_were_dropped_or_never_there():
 def test_before_the_first_step_there_are_no_moments():
     blobs = Blobs(4)
     optimizer = torch.optim.Adam(blobs.parameters())
-    rebuild(blobs, optimizer, Growth(torch.arange(2), torch.ones(2, dtype=torch.bool)))
+    apply_growth(blobs, optimizer, Growth(torch.arange(2), torch.ones(2, dtype=torch.bool)))
     assert not optimizer.state and len(blobs.places) == 2
 
 
@@ -117,7 +119,7 @@ def test_all_may_go():
     blobs = Blobs(4)
     optimizer = pulled_twice(blobs)
     none = torch.zeros(0, dtype=torch.int64)
-    rebuild(blobs, optimizer, Growth(none, none.bool()))
+    apply_growth(blobs, optimizer, Growth(none, none.bool()))
     assert blobs.places.shape == (0, 2)
     blobs(torch.rand(9, 2)).sum().backward()
     optimizer.step()
@@ -200,4 +202,4 @@ def test_unknown_names_are_noticed():
     growth = unchanged(2)
     growth.values["sizes"] = torch.zeros(2)
     with pytest.raises(AssertionError, match="no points named {'sizes'}"):
-        rebuild(blobs, torch.optim.Adam(blobs.parameters()), growth)
+        apply_growth(blobs, torch.optim.Adam(blobs.parameters()), growth)
