@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from sharpfield.core.errors import Hint
 
@@ -23,7 +23,10 @@ class PluginWarning(Hint):
     """An installed package offers something that cannot be used."""
 
 
-class Registry(Mapping[str, Any]):
+T = TypeVar("T")
+
+
+class Registry(Mapping[str, T]):
     """Objects by name: our own, and those of installed packages, which are loaded when asked for.
 
     Args:
@@ -32,15 +35,14 @@ class Registry(Mapping[str, Any]):
             over entry points of the same name.
     """
 
-    def __init__(self, group: str, own: Mapping[str, Any]) -> None:
+    def __init__(self, group: str, own: Mapping[str, T | str]) -> None:
         self.group, self.own = group, dict(own)
 
-    def __getitem__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> T:
         if name in self.own:
             found = self.own[name]
             if isinstance(found, str):
-                found = EntryPoint(name, found, self.group).load()
-                self.own[name] = found
+                found = self.own[name] = cast(T, EntryPoint(name, found, self.group).load())
             return found
         found = _loaded(_installed(self.group)[name])
         if found is None:
@@ -55,7 +57,7 @@ class Registry(Mapping[str, Any]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
-    def working(self) -> dict[str, Any]:
+    def working(self) -> dict[str, T]:
         """All objects that can be loaded."""
         found = {name: self.get(name) for name in self}
         return {name: one for name, one in found.items() if one is not None}

@@ -6,7 +6,7 @@ and a `Recipe` builds a `Model` from these on one capture.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float, Int64
 from torch import Generator, Tensor
@@ -194,7 +194,11 @@ class Growing(Protocol):
 
 @runtime_checkable
 class Recipe(Protocol):
-    """A paper's numbers (a frozen dataclass), and the one function that builds its model."""
+    """A paper's numbers (a frozen dataclass), and the one function that builds its model.
+
+    Besides, a recipe may have the class variables `presets` (see `recipes.settings.presets`) and
+    `renamed`, which maps old names of its options to new ones.
+    """
 
     paper: ClassVar[Paper]
 
@@ -207,8 +211,8 @@ class Recipe(Protocol):
         """The same recipe with its whole schedule stretched or shrunk."""
         ...
 
-    def build(self, capture: "Capture", seed: int) -> Any:
-        """A `Model` on one capture."""
+    def build(self, capture: "Capture", seed: int) -> Model:
+        """The model of this recipe on one capture."""
         ...
 
 

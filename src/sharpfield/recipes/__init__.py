@@ -5,10 +5,13 @@ A package of your own adds recipes by the entry point `sharpfield.recipes`.
 
 import ast
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sharpfield.core.errors import OptionError, did_you_mean
 from sharpfield.core.plugins import Registry
+
+if TYPE_CHECKING:  # the names of recipes are known without importing torch
+    from sharpfield.core.protocols import Recipe
 
 OWN = {
     "nerf": "sharpfield.recipes.nerf:NeRF",
@@ -29,11 +32,11 @@ OWN = {
 }
 """Where the recipes of this package are."""
 
-RECIPES = Registry("sharpfield.recipes", OWN)
+RECIPES: "Registry[type[Recipe]]" = Registry("sharpfield.recipes", OWN)
 """Classes by the name that the command line knows; those of other packages included."""
 
 
-def recipe_named(name: str) -> Any:
+def recipe_named(name: str) -> "type[Recipe]":
     """A recipe's class.
 
     Raises:

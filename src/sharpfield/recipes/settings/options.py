@@ -14,11 +14,13 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 
 from sharpfield.core.errors import Hint, OptionError, did_you_mean
+
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def options_of(recipe: Any, group: str = "") -> dict[str, Option]:
     return found
 
 
-def with_options(recipe: Any, values: Mapping[str, Any]) -> Any:
+def with_options(recipe: R, values: Mapping[str, Any]) -> R:
     """A recipe with some of its options changed.
 
     Args:
@@ -74,7 +76,7 @@ def with_options(recipe: Any, values: Mapping[str, Any]) -> Any:
     return recipe
 
 
-def changed(recipe: Any, changes: Sequence[str]) -> Any:
+def changed(recipe: R, changes: Sequence[str]) -> R:
     """A recipe with some of its options changed, each written as NAME=VALUE.
 
     Raises:

@@ -15,6 +15,7 @@ from sharpfield.recipes import recipe_named
 
 if TYPE_CHECKING:  # a list of recipes needs no torch
     from sharpfield.core.capture import Capture
+    from sharpfield.core.protocols import Recipe
 
 Change = Callable[[Any], Any]
 """From a recipe to a changed one; the first line of its docstring says what it means."""
@@ -71,7 +72,7 @@ def presets_of(recipe: Any) -> Presets:
     return getattr(recipe, "presets", NO_PRESETS)
 
 
-def prepared(name: str, preset: str = "", *, capture: "Capture", device: str) -> Any:
+def prepared(name: str, preset: str = "", *, capture: "Capture", device: str) -> "Recipe":
     """A recipe with presets applied; what `preset` leaves open follows capture and machine.
 
     Args:
