@@ -62,15 +62,15 @@ def test_light_is_where_the_integral_holds() -> None:
 def test_known_thresholds_are_used_and_others_found() -> None:
     noted = replace(capture(), known=Known(thresholds=Thresholds(0.3, 0.4)))
     known = deblur(noted, DeblurOptions()).found
-    assert (known.thresholds.negative, known.thresholds.positive, known.judge) == (
+    assert (known.thresholds.negative, known.thresholds.positive, known.source) == (
         0.3,
         0.4,
         "known",
     )
     given = deblur(noted, DeblurOptions(threshold=0.17)).found
-    assert (given.thresholds.negative, given.judge) == (0.17, "given")
+    assert (given.thresholds.negative, given.source) == (0.17, "given")
     silent = deblur(replace(capture(), known=Known()), DeblurOptions()).found
-    assert silent.judge == "disagreement"
+    assert silent.source == "disagreement"
     assert silent.thresholds.negative == pytest.approx(THRESHOLD, rel=0.15)
     assert silent.thresholds.positive == pytest.approx(THRESHOLD, rel=0.15)
 
@@ -84,7 +84,7 @@ def test_single_frame_leaves_the_density_of_edges() -> None:
     )  # fmt: skip
     single = replace(capture(), frames=one, split=Split(np.array([0]), np.zeros(0, np.int64)))
     found = find_thresholds(single, EventMotion.of(single))
-    assert found.judge == "edge density"
+    assert found.source == "edge density"
     assert 0.5 * THRESHOLD < found.thresholds.positive < 2 * THRESHOLD
 
 

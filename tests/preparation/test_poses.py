@@ -22,8 +22,8 @@ from sharpfield.preparation.options import PoseOptions
 from sharpfield.preparation.poses import mapping as poses_mapping
 from sharpfield.preparation.poses.external import Mount, attach, known_at
 from sharpfield.preparation.poses.find import PosesFound, find_poses
-from sharpfield.preparation.poses.images import sharp_images
-from sharpfield.preparation.poses.path import carried_on
+from sharpfield.preparation.poses.images import sfm_images
+from sharpfield.preparation.poses.path import extrapolated
 from sharpfield.preparation.poses.report import as_text, summary
 from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
@@ -56,7 +56,7 @@ def true_poses(times_us: np.ndarray) -> torch.Tensor:
 
 
 def test_all_frames_register_from_deblurred_images_where_plain_frames_lose_some() -> None:
-    assert found().map.registered.all() and found().sharp.source == "edi"
+    assert found().map.registered.all() and found().images.source == "edi"
     middle = fast().needed_frames.exposure.middle_us
     error = absolute_error(found().capture.frame_pose(np.arange(7)).double(), true_poses(middle))
     spread = true_poses(middle)[:, :, 3].std(0).norm()
@@ -118,7 +118,9 @@ def test_known_positions_give_the_world() -> None:
     apart = made.capture.frame_pose(np.arange(7)) - true_poses(middle).float()
     extent = true_poses(middle)[:, :, 3].std(0).norm()
     assert apart[:, :, 3].norm(dim=-1).max() < 0.1 * extent
-    assert made.off_known is not None and made.off_known < 0.05 * extent
+    assert made.errors is not None
+    assert made.errors.absolute.translation < 0.05 * extent
+    assert made.errors.relative.rotation_deg < 5
 
 
 def test_the_real_blurry_scene_registers(tmp_path: Path) -> None:
@@ -187,17 +189,17 @@ def test_poses_without_times_must_be_as_many_as_the_frames() -> None:
 def test_a_path_is_carried_on_at_its_speed_and_not_too_far() -> None:
     poses = np.stack([np.eye(3, 4) for _ in range(3)])
     poses[:, 0, 3] = [0, 1, 2]
-    times, more = carried_on(np.array([100, 200, 300]), poses, (50, 1000))
+    times, more = extrapolated(np.array([100, 200, 300]), poses, (50, 1000))
     assert times.tolist() == [50, 100, 200, 300, 400]
     np.testing.assert_allclose(more[:, 0, 3], [-0.5, 0, 1, 2, 3])
 
 
 def test_only_events_tell_several_instants_apart() -> None:
-    with pytest.raises(OptionError, match="only events tell"):
-        sharp_images(fast().without(events=True), "auto", instants=3)
-    made = sharp_images(fast(), "edi", instants=2)
+    with pytest.raises(OptionError, match="need events"):
+        sfm_images(fast().without(events=True), "auto", instants=3)
+    made = sfm_images(fast(), "edi", instants=2)
     assert len(made) == 14 and (np.diff(made.time_us) > 0).all()
-    assert len(sharp_images(fast(), "sharpest")) == 3
+    assert len(sfm_images(fast(), "sharpest")) == 3
 
 
 def test_images_without_texture_are_refused_with_a_reason() -> None:

@@ -8,7 +8,7 @@ from scipy.stats import spearmanr
 from sharpfield.core.capture import Split
 from sharpfield.core.errors import OptionError
 from sharpfield.preparation.options import QualityOptions
-from sharpfield.preparation.quality import as_table, judged, quality_to, rank_correlation
+from sharpfield.preparation.quality import as_table, measure_quality, quality_to, rank_correlation
 from sharpfield.simulation.room_capture import RoomTiming, simulate_room
 from sharpfield.simulation.static_capture import Rig
 from sharpfield.storage.images import read_image
@@ -20,10 +20,10 @@ def walked():
 
 
 def test_what_is_written_is_what_is_said(walked, tmp_path):
-    found, told_by = judged(walked, QualityOptions())
-    quality_to(walked, found, told_by, tmp_path)
+    found, measured_by = measure_quality(walked, QualityOptions())
+    quality_to(walked, found, measured_by, tmp_path)
     told = json.loads((tmp_path / "quality.json").read_text())
-    assert told == as_table(walked, found, told_by) and told["told_by"] == "depth"
+    assert told == as_table(walked, found, measured_by) and told["told_by"] == "depth"
     assert [row["name"] for row in told["frames"]] == [walked.frames.names[i] for i in found.frames]
     assert set(told["frames"][0]) == {"name", "score", "weight", "true_blur_px"}
     np.testing.assert_array_equal(np.load(tmp_path / "weights.npy"), found.weights)
@@ -32,9 +32,9 @@ def test_what_is_written_is_what_is_said(walked, tmp_path):
 
 def test_without_truth_nothing_is_said_about_it(walked):
     blind = replace(walked, frames=replace(walked.frames, blur_px=None), depth=None)
-    found, told_by = judged(blind, QualityOptions(every_frame=True))
-    table = as_table(blind, found, told_by)
-    assert told_by == "flow" and len(table["frames"]) == 9
+    found, measured_by = measure_quality(blind, QualityOptions(every_frame=True))
+    table = as_table(blind, found, measured_by)
+    assert measured_by == "flow" and len(table["frames"]) == 9
     assert set(table["frames"][0]) == {"name", "score", "weight"}
     assert "rank_correlation" not in table
 
@@ -49,4 +49,4 @@ def test_ranks_are_those_of_scipy():
 def test_one_frame_cannot_be_judged(walked):
     alone = replace(walked, split=Split(np.array([3]), np.array([1])))
     with pytest.raises(OptionError, match="fewer than two"):
-        judged(alone, QualityOptions())
+        measure_quality(alone, QualityOptions())

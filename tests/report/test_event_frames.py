@@ -9,7 +9,7 @@ from sharpfield.report.event_frames import (
     count_events,
     signed,
     windows,
-    without_few,
+    without_low_counts,
     writing_frames,
 )
 from sharpfield.storage.images import read_image
@@ -45,11 +45,11 @@ def test_few_events_are_left_out_by_the_frames_own_largest_count():
     frames = np.array(
         [[[10, -3, 2, 0]], [[-7, 2, 3, -2]], [[6, 2, -1, -2]], [[0, 0, 0, 0]]], np.int32
     )
-    left = without_few(frames, 0.3)
+    left = without_low_counts(frames, 0.3)
     expected = [[[10, -3, 0, 0]], [[-7, 0, 3, 0]], [[6, 2, 0, -2]], [[0, 0, 0, 0]]]
     np.testing.assert_array_equal(left, expected)
-    np.testing.assert_array_equal(without_few(-frames, 0.3), -left)
-    np.testing.assert_array_equal(without_few(frames, 0.0), frames)
+    np.testing.assert_array_equal(without_low_counts(-frames, 0.3), -left)
+    np.testing.assert_array_equal(without_low_counts(frames, 0.0), frames)
 
 
 def test_a_folder_holds_arrays_images_and_a_video(tmp_path):
@@ -58,7 +58,7 @@ def test_a_folder_holds_arrays_images_and_a_video(tmp_path):
         write_frames(tmp_path / "frames", counts, least_share=0.5)
     np.testing.assert_array_equal(np.load(tmp_path / "frames" / "counts.npy"), counts)
     frames = np.load(tmp_path / "frames" / "frames.npy")
-    np.testing.assert_array_equal(frames, without_few(signed(np.stack(counts)), 0.5))
+    np.testing.assert_array_equal(frames, without_low_counts(signed(np.stack(counts)), 0.5))
     image = read_image(tmp_path / "frames" / "0003.png").astype(int)
     red, blue = (image[..., a] > image[..., b] for a, b in ((0, 2), (2, 0)))
     np.testing.assert_array_equal(red, frames[3] > 0)
@@ -74,7 +74,7 @@ def test_windows_without_any_event_are_white(tmp_path):
 
 def test_other_folders_are_not_replaced(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(OptionError, match="other things than event frames"):
+    with pytest.raises(OptionError, match="other files than event frames"):
         write_frames(tmp_path, [np.zeros((4, 6, 2), np.int32)])
     assert (tmp_path / "thesis.tex").exists()
 

@@ -29,18 +29,18 @@ def quality_command(
         json: Print JSON with the score and weight of every frame.
         out: Folder for `quality.json`, `ranking.png` and `weights.npy`.
         layout: Of the capture, if it is not recognised.
-        options: How frames are judged.
+        options: How sharpness is measured.
     """
     from rich.table import Table
 
     from sharpfield.captures.read import read_capture
-    from sharpfield.preparation.quality import as_table, judged, quality_to
+    from sharpfield.preparation.quality import as_table, measure_quality, quality_to
 
     held = read_capture(capture, ReadOptions(layout=layout))
-    found, told_by = judged(held, options)
-    about = as_table(held, found, told_by)
+    found, measured_by = measure_quality(held, options)
+    about = as_table(held, found, measured_by)
     if out is not None:
-        quality_to(held, found, told_by, out)
+        quality_to(held, found, measured_by, out)
     if json:
         print(json_format.dumps(about, indent=2))
         return
@@ -48,7 +48,9 @@ def quality_command(
     ranked = sorted(about["frames"], key=lambda row: row["score"])
     shown = ranked if len(ranked) <= SHOWN else [*ranked[: SHOWN // 2], *ranked[-SHOWN // 2 :]]
     columns = list(shown[0])
-    table = Table(*columns, title=f"{len(ranked)} frames, blurriest first, judged by {told_by}")
+    table = Table(
+        *columns, title=f"{len(ranked)} frames, blurriest first, measured by {measured_by}"
+    )
     for row in shown:
         cells = [row[key] if key == "name" else f"{row[key]:.3g}" for key in columns]
         table.add_row(*cells)

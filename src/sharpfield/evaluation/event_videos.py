@@ -23,7 +23,7 @@ from sharpfield.evaluation.event_scores import (
     mean_threshold,
 )
 from sharpfield.report.colormaps import colour_signs
-from sharpfield.report.event_frames import busy
+from sharpfield.report.event_frames import full_count
 from sharpfield.report.tables import TextTable
 from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
@@ -39,7 +39,7 @@ HIGH_PX = 240
 GAP_PX = 4
 """Between the two."""
 
-Colours = UInt8[np.ndarray, "height width 3"]
+Rgb = UInt8[np.ndarray, "height width 3"]
 
 
 def event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
@@ -91,7 +91,7 @@ def events_section(run: Path, metrics: Mapping[str, Any]) -> dict[str, Any] | No
     }
 
 
-def _images(model: Model, capture: Capture, track: int) -> list[Colours]:
+def _images(model: Model, capture: Capture, track: int) -> list[Rgb]:
     """Both frames of each window."""
     assert capture.test_events is not None
     index = event_index(capture.test_events)
@@ -106,14 +106,14 @@ def _images(model: Model, capture: Capture, track: int) -> list[Colours]:
         for a, b in zip(ends, ends[1:], strict=False)
     ]
     recorded = [brighter - darker for darker, brighter in counts]
-    full = busy(np.stack(recorded).astype(np.int32))
+    full = full_count(np.stack(recorded).astype(np.int32))
     return [
         _beside(*(colour_signs(frame, full) for frame in pair))
         for pair in zip(recorded, predicted, strict=True)
     ]
 
 
-def _beside(left: Colours, right: Colours) -> UInt8[np.ndarray, "high wide 3"]:
+def _beside(left: Rgb, right: Rgb) -> UInt8[np.ndarray, "high wide 3"]:
     """Both, enlarged."""
     times = max(HIGH_PX // left.shape[0], 1)
     left, right = (np.kron(one, np.ones((times, times, 1), np.uint8)) for one in (left, right))

@@ -1,9 +1,8 @@
-"""Deblur the frames of a capture with its events alone: the event double integral, frame by frame.
+"""Deblur the frames of a capture by the event double integral (EDI), frame by frame.
 
-No scene is learned. It is the quickest look at what the events of a capture know, and a check of
-thresholds, clocks and pixel grids: where these are wrong, the images get worse, not better.
-
-What deblurring leaves behind: images, a sheet of before and after, numbers.
+No scene is learned. It is a quick test of events, thresholds, clocks and pixel grids: where one of
+these is wrong, the images get worse instead of sharper. Output: images, a contact sheet of blurred
+and deblurred frames, and metrics.
 """
 
 from dataclasses import dataclass
@@ -25,39 +24,46 @@ from sharpfield.events.threshold import FixedThresholds
 from sharpfield.events.threshold_search import edge_density
 from sharpfield.metrics.image import gradient_energy, psnr
 from sharpfield.preparation.options import DeblurOptions
-from sharpfield.preparation.thresholds import Found, find_thresholds, known_thresholds, linear_light
+from sharpfield.preparation.thresholds import (
+    FoundThresholds,
+    find_thresholds,
+    known_thresholds,
+    linear_light,
+)
+from sharpfield.report.colormaps import stored_as_bytes
 from sharpfield.storage.images import write_image
 
 
 @dataclass(frozen=True)
 class Deblurred:
-    """Sharp images of the frames of a capture, as the frames are stored."""
+    """Sharp images of the frames of a capture, in the frames' own encoding."""
 
     images: Shaped[np.ndarray, "n k h w c"]
-    """One per instant of each exposure."""
+    """One image per instant of each exposure."""
     frame: Int64[np.ndarray, "n"]
-    """Index of each one's frame in the capture."""
+    """Index of the frame in the capture."""
     instants_us: Int64[np.ndarray, "n k"]
-    found: Found
+    found: FoundThresholds
+    """Thresholds that were used."""
 
 
 def deblur(capture: Capture, options: DeblurOptions) -> Deblurred:
-    """Sharp images of the frames to learn from; of all blurred frames if none are named.
+    """Sharp images of the training frames, or of all blurred frames if there are none.
 
     Raises:
         CaptureError: Frames or events are missing, or no frame is blurred.
     """
-    held = capture.needed_frames
-    chosen = capture.split.train if len(capture.split.train) else np.arange(len(held))
-    chosen = chosen[~held.exposure.instant[chosen]]
+    frames = capture.needed_frames
+    chosen = capture.split.train if len(capture.split.train) else np.arange(len(frames))
+    chosen = chosen[~frames.exposure.instant[chosen]]
     if not len(chosen):
         raise CaptureError(
             "no frame to deblur has an exposure", where=capture.name, do="give exposure times"
         )
-    chosen = chosen[np.argsort(held.exposure.open_us[chosen], kind="stable")]
+    chosen = chosen[np.argsort(frames.exposure.open_us[chosen], kind="stable")]
     motion = EventMotion.of(capture)
     found = _thresholds(capture, motion, options)
-    opens, length = held.exposure.open_us[chosen], held.exposure.duration_us[chosen]
+    opens, length = frames.exposure.open_us[chosen], frames.exposure.duration_us[chosen]
     parts = (np.arange(options.instants) + 0.5) / options.instants
     instants = opens[:, None] + np.rint(length[:, None] * parts).astype(np.int64)
     if options.method == "joint":
@@ -74,11 +80,11 @@ def deblur(capture: Capture, options: DeblurOptions) -> Deblurred:
     return Deblurred(images, chosen, instants, found)
 
 
-def _thresholds(capture: Capture, motion: EventMotion, options: DeblurOptions) -> Found:
+def _thresholds(capture: Capture, motion: EventMotion, options: DeblurOptions) -> FoundThresholds:
     if not isinstance(options.threshold, str):
-        return Found(FixedThresholds(options.threshold, options.threshold), "given")
+        return FoundThresholds(FixedThresholds(options.threshold, options.threshold), "given")
     known = known_thresholds(capture) if options.threshold == "known" else None
-    return find_thresholds(capture, motion) if known is None else Found(known, "known")
+    return find_thresholds(capture, motion) if known is None else FoundThresholds(known, "known")
 
 
 def _exact(
@@ -98,8 +104,8 @@ def _exact(
 def _published(
     capture: Capture, frame: int, thresholds: FixedThresholds
 ) -> Shaped[np.ndarray, "1 h w c"]:
-    held = capture.needed_frames
-    stored = torch.from_numpy(np.asarray(held.images[frame], np.float32)) / held.white
+    frames = capture.needed_frames
+    stored = torch.from_numpy(np.asarray(frames.images[frame], np.float32)) / frames.white
     window = capture.needed_frames.exposure.window(frame)
     return _stored(capture, published(stored, capture.needed_events, window, thresholds)[None])
 
@@ -111,7 +117,7 @@ def _joint(
     middles_us: Int64[np.ndarray, "n"],
     thresholds: FixedThresholds,
 ) -> Shaped[np.ndarray, "n 1 h w c"]:
-    """The events of a mono sensor tell of luma; each colour then follows the luma of its pixel."""
+    """A monochrome sensor gives the luma; each colour is scaled with the luma of its pixel."""
     tone = tone_of(capture.needed_frames.encoding)
     sharp = []
     for frame, middle in zip(frames, middles_us, strict=True):
@@ -120,25 +126,25 @@ def _joint(
         )
         sharp.append(latent(linear_light(capture, int(frame), tone), path, 0))
     sharp = torch.stack(sharp)
-    told = sharp if motion.channel is not None else luma(sharp)[..., None]
+    observed = sharp if motion.channel is not None else luma(sharp)[..., None]
     gaps = [
         motion.between(int(start), int(end), thresholds)
         for start, end in zip(middles_us[:-1], middles_us[1:], strict=True)
     ]
-    alone = (told + FLOOR).log()
+    alone = (observed + FLOOR).log()
     agreed = joint_latents(alone, torch.stack(gaps)) if gaps else alone
     made = tone.encode((sharp * (agreed - alone).exp()).clamp(0, 1))
     return _stored(capture, made)[:, None]
 
 
 def _stored(capture: Capture, image: Float[Tensor, "*n h w c"]) -> Shaped[np.ndarray, "*n h w c"]:
-    """Rounded to the frames' own type."""
+    """Rounded to the data type of the frames."""
     frames = capture.needed_frames
     return np.rint(image.clamp(0, 1).numpy() * frames.white).astype(frames.images.dtype)
 
 
 SHEET_ROWS, GAP = 4, 4
-"""The contact sheet: so many frames below each other, so many pixels between images."""
+"""Rows of the contact sheet, and pixels between its images."""
 
 Image = Shaped[np.ndarray, "h w c"]
 
@@ -162,11 +168,11 @@ def deblur_to(capture: Capture, out: Path, options: DeblurOptions) -> Deblurred:
 
 
 def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
-    """Thresholds, times and scores, ready for JSON.
+    """Thresholds, times and metrics as plain values for JSON.
 
-    Scores are those of the image nearest the middle of each exposure, and of the blurred frame
-    before: the density of edges (lower is sharper), the energy of the gradient (higher is sharper,
-    or noisier), and PSNR where the truth is known.
+    Metrics are given for the blurred frame and for the image nearest to the middle of its exposure:
+    edge density (lower is sharper), gradient energy (higher is sharper, or noisier), and PSNR where
+    the truth is known.
     """
     rows = [
         {
@@ -185,7 +191,7 @@ def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
         "thresholds": {
             "negative": used.negative,
             "positive": used.positive,
-            "from": made.found.judge,
+            "from": made.found.source,
             "cost": made.found.cost,
         },
         "mean": {when: _mean([row[when] for row in rows]) for when in ("before", "after")},
@@ -194,17 +200,15 @@ def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
 
 
 def contact_sheet(capture: Capture, made: Deblurred) -> UInt8[np.ndarray, "H W 3"]:
-    """Blurred, deblurred and, where known, true images side by side, a few frames of them."""
-    held = capture.needed_frames
+    """Blurred, deblurred and, where known, true images of a few frames side by side."""
+    frames = capture.needed_frames
     rows = evenly_spread(np.arange(len(made.frame)), SHEET_ROWS)
     lines = []
     for row in rows:
         frame = int(made.frame[row])
-        line = [held.images[frame], _middle(made.images[row])]
+        line = [frames.images[frame], _middle(made.images[row])]
         truth = _truth(capture, frame)
-        lines.append(
-            [_eight_bit(image, held.white) for image in [*line, truth] if image is not None]
-        )
+        lines.append([_rgb(image) for image in [*line, truth] if image is not None])
     widest = max(len(line) for line in lines)
     height, width = lines[0][0].shape[:2]
     sheet = np.full(
@@ -248,14 +252,13 @@ def _mean(scores: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _truth(capture: Capture, frame: int) -> Image | None:
-    held = capture.needed_frames
-    return held.truth[frame] if held.truth is not None and held.with_truth[frame] else None
+    frames = capture.needed_frames
+    return frames.truth[frame] if frames.truth is not None and frames.with_truth[frame] else None
 
 
 def _middle(images: Shaped[np.ndarray, "k h w c"]) -> Image:
     return images[len(images) // 2]
 
 
-def _eight_bit(image: Image, white: int) -> UInt8[np.ndarray, "h w 3"]:
-    scaled = np.rint(np.asarray(image, np.float64) * (255 / white)).astype(np.uint8)
-    return np.broadcast_to(scaled, (*scaled.shape[:2], 3))
+def _rgb(image: Image) -> UInt8[np.ndarray, "h w 3"]:
+    return np.broadcast_to(stored_as_bytes(image), (*image.shape[:2], 3))

@@ -1,4 +1,4 @@
-"""Options of the preparing commands, apart from what they do, so that reading them is quick."""
+"""Options of the commands that prepare captures, in a module that imports nothing heavy."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -6,7 +6,7 @@ from typing import Literal
 from sharpfield.core.errors import OptionError
 
 Method = Literal["exact", "joint", "published"]
-Source = Literal["auto", "edi", "frames", "sharpest"]
+ImageSource = Literal["auto", "edi", "frames", "sharpest"]
 Intrinsics = Literal["given", "refine", "find"]
 Lens = Literal["pinhole", "radial", "brown", "fisheye"]
 
@@ -16,14 +16,14 @@ class DeblurOptions:
     """How frames are deblurred."""
 
     threshold: float | Literal["known", "find"] = "known"
-    """Contrast threshold of both signs. `known` takes what the capture's source says and finds
-    thresholds where it is silent; `find` finds them in any case."""
+    """Contrast threshold of both polarities. `known` takes those that the capture states, and
+    searches for them where it states none; `find` always searches."""
     method: Method = "exact"
     """`exact`: in linear light, integrated from event to event. `joint`: the same, then all frames
-    made to agree with the events between them. `published`: as the released Ev-DeblurNeRF does it,
+    are made consistent with the events between them. `published`: as in the released Ev-DeblurNeRF,
     on stored values with eight slices."""
     instants: int = 1
-    """Images per exposure, in the middles of as many equal parts of it. Only for `exact`."""
+    """Images per exposure, at the middles of as many equal parts of it. Only for `exact`."""
 
     def __post_init__(self) -> None:
         if self.instants < 1 or (self.instants > 1 and self.method != "exact"):
@@ -36,35 +36,35 @@ class DeblurOptions:
 
 @dataclass(frozen=True)
 class QualityOptions:
-    """How frames are judged."""
+    """How the sharpness of frames is measured."""
 
     source: Literal["auto", "images", "events"] = "auto"
-    """What tells: auto takes events where the capture has them."""
+    """Measure by images or by events; auto uses events where the capture has them."""
     overlap: Literal["auto", "depth", "flow"] = "auto"
-    """What two images both show: by depth (auto, where there is some) or optical flow."""
+    """Overlap of two images: by depth (auto, where there is some) or by optical flow."""
     way: Literal["reconciled", "published"] = "reconciled"
-    """Compare with several neighbours; or as published, with the next only."""
+    """Compare each frame with several neighbours; or as published, with the next only."""
     every_frame: bool = False
-    """Judge held-out frames, too."""
+    """Include held-out frames."""
 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """How poses are found."""
+    """How poses are found by structure from motion."""
 
-    images: Source = "auto"
-    """`edi`: frames deblurred with their events. `frames`: as they are. `sharpest`: only the
+    images: ImageSource = "auto"
+    """`edi`: frames deblurred with their events. `frames`: as recorded. `sharpest`: only the
     sharpest of each three neighbours. `auto`: `edi` where there are events and exposures."""
     instants: int | None = None
-    """Images taken from each exposure, with `edi`; more make the path finer, and take longer.
-    By default three, or fewer where that would be more than 120 images."""
+    """Images of each exposure, with `edi`; more give a finer trajectory and take longer. By default
+    three, or fewer where that would be more than 120 images."""
     intrinsics: Intrinsics | None = None
-    """`given` keeps the camera, `refine` starts from its focal length, `find` knows nothing; by
-    default `given`, or `find` where the capture does not know its focal length."""
+    """`given` keeps the camera, `refine` starts from its focal length, `find` estimates all; by
+    default `given`, or `find` where the focal length of the capture is unknown."""
     lens: Lens = "pinhole"
-    """What to look for, with `find`."""
+    """Lens model to estimate with `find`."""
     seed: int = 0
-    """Of what is drawn by chance."""
+    """Random seed of RANSAC."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,6 @@ class CalibrateOptions:
     """How thresholds are measured."""
 
     pairs: int = 12
-    """Pairs of exposures looked at, spread over the capture."""
+    """Number of exposure pairs, spread over the capture."""
     seed: int = 0
-    """Of the bootstrap."""
+    """Random seed of the bootstrap."""

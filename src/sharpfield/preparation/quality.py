@@ -1,6 +1,6 @@
-"""Which frames of a video are sharp: scores, weights, and a image of the ranking.
+"""Sharpness of the frames of a video: scores, weights, and a figure of the ranking.
 
-Blur a folder of sharp images, each by one random motion kernel, and say what was done.
+`blur_images` makes test data: it blurs a folder of sharp images by random motion kernels.
 """
 
 import json
@@ -16,6 +16,7 @@ from sharpfield.core.files import replacing, replacing_folder, write_json
 from sharpfield.core.seed import numpy_generator
 from sharpfield.metrics.quality import Quality, event_quality, frame_quality
 from sharpfield.preparation.options import QualityOptions
+from sharpfield.report.colormaps import stored_as_bytes
 from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.storage.images import list_images, read_image, write_image
 
@@ -25,11 +26,11 @@ else:  # matplotlib is imported when a figure is drawn
     Figure = Any
 
 SHOWN = 5
-"""Frames at each end of the ranking that the image shows."""
+"""Frames at each end of the ranking that the figure shows."""
 
 
-def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
-    """Scores and weights, and what told: "events", "depth" or "flow".
+def measure_quality(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
+    """Scores and weights, and what they are measured by: "events", "depth" or "flow".
 
     Raises:
         OptionError: There are fewer than two frames to compare.
@@ -39,9 +40,9 @@ def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
     frames = every if options.every_frame else capture.split.train
     if len(frames) < 2:
         raise OptionError(
-            "quality compares frames, and there are fewer than two",
+            "sharpness is relative to other frames, and there are fewer than two",
             where=capture.name,
-            do="judge held-out frames, too: --every-frame",
+            do="include held-out frames: --every-frame",
         )
     single = capture.events is not None and capture.events.track is None
     if options.source == "events" or (options.source == "auto" and single):
@@ -51,8 +52,8 @@ def judged(capture: Capture, options: QualityOptions) -> tuple[Quality, str]:
     return found, "depth" if by_depth else "flow"
 
 
-def as_table(capture: Capture, found: Quality, told_by: str) -> dict[str, Any]:
-    """Numbers ready for JSON; where the true blur is known, how well scores rank it."""
+def as_table(capture: Capture, found: Quality, measured_by: str) -> dict[str, Any]:
+    """Plain values for JSON; with the rank correlation where the true blur is known."""
     names = capture.needed_frames.names
     true = _true_blur(capture, found)
     rows: list[dict[str, Any]] = []
@@ -63,32 +64,32 @@ def as_table(capture: Capture, found: Quality, told_by: str) -> dict[str, Any]:
             "weight": float(found.weights[k]),
         }
         rows.append(row if true is None else row | {"true_blur_px": float(true[k])})
-    about: dict[str, Any] = {"capture": capture.name, "told_by": told_by, "frames": rows}
+    about: dict[str, Any] = {"capture": capture.name, "told_by": measured_by, "frames": rows}
     if true is not None:
         about["rank_correlation"] = rank_correlation(found.scores, -true)
     return about
 
 
-def quality_to(capture: Capture, found: Quality, told_by: str, out: Path) -> None:
-    """Write `quality.json`, `ranking.png` and `weights.npy` (a weight for each judged frame)."""
+def quality_to(capture: Capture, found: Quality, measured_by: str, out: Path) -> None:
+    """Write `quality.json`, `ranking.png` and `weights.npy` (the weight of each frame)."""
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "quality.json", as_table(capture, found, told_by))
+    write_json(out / "quality.json", as_table(capture, found, measured_by))
     with replacing(out / "weights.npy") as temporary:
         np.save(temporary, found.weights)
     with replacing(out / "ranking.png") as temporary:
-        ranking(capture, found, told_by).savefig(temporary, dpi=110)
+        ranking(capture, found, measured_by).savefig(temporary, dpi=110)
 
 
 def rank_correlation(a: Float64[np.ndarray, "m"], b: Float64[np.ndarray, "m"]) -> float:
-    """Spearman's correlation: that of the ranks, where equal values share the mean of theirs."""
+    """Spearman's rank correlation; equal values get their mean rank."""
     one, other = _ranks(a), _ranks(b)
     if one.std() == 0 or other.std() == 0:
         return 0.0
     return float(np.corrcoef(one, other)[0, 1])
 
 
-def ranking(capture: Capture, found: Quality, told_by: str) -> Figure:
-    """Scores and weights along the video, and the blurriest and sharpest frames."""
+def ranking(capture: Capture, found: Quality, measured_by: str) -> Figure:
+    """Figure of scores and weights along the video, with the blurriest and sharpest frames."""
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -99,7 +100,7 @@ def ranking(capture: Capture, found: Quality, told_by: str) -> Figure:
         grid = figure.add_gridspec(4, shown)
         along = figure.add_subplot(grid[0, :])
         along.semilogy(found.frames, found.scores / found.scores.mean(), color="0.4", lw=1)
-        along.set_ylabel(f"score ({told_by})")
+        along.set_ylabel(f"score ({measured_by})")
         true = _true_blur(capture, found)
         if true is not None:
             truth = along.twinx()
@@ -121,9 +122,7 @@ def ranking(capture: Capture, found: Quality, told_by: str) -> Figure:
 
 
 def _shown(capture: Capture, frame: int) -> UInt8[np.ndarray, "h w *c"]:
-    image = np.asarray(capture.needed_frames.images[frame])
-    if image.dtype != np.uint8:
-        image = np.rint(image * (255.0 / capture.needed_frames.white)).astype(np.uint8)
+    image = stored_as_bytes(capture.needed_frames.images[frame])
     return image if image.shape[-1] == 3 else image[..., 0]
 
 
@@ -133,8 +132,8 @@ def _true_blur(capture: Capture, found: Quality) -> Float64[np.ndarray, "m"] | N
 
 
 def _ranks(values: Float64[np.ndarray, "m"]) -> Float64[np.ndarray, "m"]:
-    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
-    return (np.cumsum(count) - 0.5 * (count + 1))[place]
+    _, rank, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - 0.5 * (count + 1))[rank]
 
 
 ABOUT = "blur.json"
@@ -143,19 +142,19 @@ ABOUT = "blur.json"
 def blur_images(
     folder: Path, out: Path, *, ranges: KernelRange = PUBLISHED, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Write blurred copies of the same names and sizes, and `blur.json`; all of it or nothing.
+    """Write blurred copies of the same names and sizes, and `blur.json`; all of them or none.
 
-    Images that stay sharp are copied byte for byte. What is drawn for a image depends on the
-    seed and its place in the order of names.
+    Images that stay sharp are copied byte for byte. The kernel of an image depends on the seed and
+    its index in the order of names.
 
     Args:
         folder: PNG or JPEG images.
         out: A new or empty folder, or an earlier result.
-        ranges: What kernels are drawn from.
-        seed: Another seed, other kernels.
+        ranges: Ranges of the random kernels.
+        seed: Random seed.
 
     Returns:
-        A row for each image: its name, whether it was blurred, k, phi, and how far it reaches.
+        A row for each image: name, whether it was blurred, size k, intensity phi, blur length.
 
     Raises:
         CaptureError: There are no images, one cannot be read, or `out` holds something else.
@@ -165,9 +164,9 @@ def blur_images(
         raise CaptureError("there are no images", where=folder, do="give PNG or JPEG files")
     if out.exists() and not (out.is_dir() and (is_result(out) or not any(out.iterdir()))):
         raise CaptureError(
-            "will not replace what is not a folder of blurred images",
+            "will not replace a folder that is not an earlier result",
             where=out,
-            do="choose another place, or empty it",
+            do="choose another folder, or empty it",
         )
     rows: list[dict[str, Any]] = []
     with replacing_folder(out) as fresh:

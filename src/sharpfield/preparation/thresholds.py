@@ -1,4 +1,4 @@
-"""The contrast thresholds of a capture: given, known from its source, or found from its frames."""
+"""Contrast thresholds of a capture: given, stated by its source, or found from blurred frames."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -23,22 +23,23 @@ from sharpfield.events.threshold_search import (
 )
 
 PAIRS = 4
-"""Pairs of neighbouring frames looked at, spread over the capture."""
+"""Number of pairs of neighbouring frames, spread over the capture."""
 
 DARK, BRIGHT = 0.01, 0.9
-"""Linear light between which a pixel's value can be trusted."""
+"""Range of linear light in which pixel values are reliable."""
 
-Judge = Literal["given", "known", "disagreement", "edge density"]
+Source = Literal["given", "known", "disagreement", "edge density"]
+"""Given by an option, stated by the capture, or found by minimising one of two costs."""
 
 
 @dataclass(frozen=True)
-class Found:
-    """Thresholds, and how they were come by."""
+class FoundThresholds:
+    """Thresholds, and where they come from."""
 
     thresholds: FixedThresholds
-    judge: Judge
+    source: Source
     cost: float | None = None
-    """What the judge says of them; see `formation.edi_threshold`."""
+    """Value of the minimised cost; see `events.threshold_search`."""
 
 
 def known_thresholds(capture: Capture) -> FixedThresholds | None:
@@ -47,11 +48,11 @@ def known_thresholds(capture: Capture) -> FixedThresholds | None:
     return None if known is None else FixedThresholds(known.negative, known.positive)
 
 
-def find_thresholds(capture: Capture, motion: EventMotion) -> Found:
+def find_thresholds(capture: Capture, motion: EventMotion) -> FoundThresholds:
     """Thresholds that explain the blurred frames best.
 
-    Neighbouring frames of one track decide by disagreement, for each sign by itself; a capture of
-    a single blurred frame leaves only the density of edges in the deblurred image.
+    With neighbouring frames of one track, their disagreement after deblurring is minimised, over
+    both polarities; with a single blurred frame, the edge density of the deblurred image.
 
     Raises:
         CaptureError: There are no frames, or no events.
@@ -60,15 +61,13 @@ def find_thresholds(capture: Capture, motion: EventMotion) -> Found:
     pairs = neighbours(capture, blurred)
     if len(pairs):
         chosen = evenly_spread(pairs, PAIRS)
-        judges = [_PairJudge.of(capture, motion, pair) for pair in chosen]
-        found = best_thresholds(
-            lambda tried: float(np.mean([judge.cost(tried) for judge in judges]))
-        )
-        cost = float(np.mean([judge.cost(found) for judge in judges]))
-        return Found(found, "disagreement", cost)
-    single = [_SingleJudge.of(capture, motion, int(frame)) for frame in blurred[:PAIRS]]
-    found = best_threshold(lambda tried: float(np.mean([judge.cost(tried) for judge in single])))
-    return Found(found, "edge density", float(np.mean([judge.cost(found) for judge in single])))
+        costs = [_PairCost.of(capture, motion, pair) for pair in chosen]
+        found = best_thresholds(lambda tried: float(np.mean([one(tried) for one in costs])))
+        cost = float(np.mean([one(found) for one in costs]))
+        return FoundThresholds(found, "disagreement", cost)
+    single = [_SingleCost.of(capture, motion, int(frame)) for frame in blurred[:PAIRS]]
+    found = best_threshold(lambda tried: float(np.mean([one(tried) for one in single])))
+    return FoundThresholds(found, "edge density", float(np.mean([one(found) for one in single])))
 
 
 def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w c"]:
@@ -79,24 +78,24 @@ def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w
 
 
 def neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
-    """Consecutive frames of one track, in order of time."""
-    held = capture.needed_frames
-    order = frames[np.lexsort((held.exposure.open_us[frames], held.track[frames]))]
+    """Pairs of consecutive frames of one track."""
+    all_frames = capture.needed_frames
+    order = frames[np.lexsort((all_frames.exposure.open_us[frames], all_frames.track[frames]))]
     pairs = np.stack([order[:-1], order[1:]], -1).reshape(-1, 2)
-    return pairs[held.track[pairs[:, 0]] == held.track[pairs[:, 1]]]
+    return pairs[all_frames.track[pairs[:, 0]] == all_frames.track[pairs[:, 1]]]
 
 
 @dataclass(frozen=True)
-class _PairJudge:
+class _PairCost:
+    """Disagreement of two neighbouring frames after deblurring with some thresholds."""
+
     motion: EventMotion
     light: Float[Tensor, "n h w c"]
     windows_us: list[tuple[int, int]]
     middles_us: list[int]
 
     @classmethod
-    def of(
-        cls, capture: Capture, motion: EventMotion, pair: Int64[np.ndarray, "2"]
-    ) -> "_PairJudge":
+    def of(cls, capture: Capture, motion: EventMotion, pair: Int64[np.ndarray, "2"]) -> "_PairCost":
         tone = tone_of(capture.needed_frames.encoding)
         light = torch.stack([linear_light(capture, int(frame), tone) for frame in pair])
         if motion.channel is None:
@@ -109,7 +108,7 @@ class _PairJudge:
             middles,
         )
 
-    def cost(self, thresholds: FixedThresholds) -> float:
+    def __call__(self, thresholds: FixedThresholds) -> float:
         paths = [
             self.motion.path(window, np.array([middle]), thresholds)
             for window, middle in zip(self.windows_us, self.middles_us, strict=True)
@@ -120,26 +119,28 @@ class _PairJudge:
 
 
 @dataclass(frozen=True)
-class _SingleJudge:
+class _SingleCost:
+    """Edge density of one frame after deblurring with some thresholds."""
+
     motion: EventMotion
     light: Float[Tensor, "h w c"]
     window_us: tuple[int, int]
     tone: Tone
 
     @classmethod
-    def of(cls, capture: Capture, motion: EventMotion, frame: int) -> "_SingleJudge":
+    def of(cls, capture: Capture, motion: EventMotion, frame: int) -> "_SingleCost":
         tone = tone_of(capture.needed_frames.encoding)
         window = capture.needed_frames.exposure.window(frame)
         return cls(motion, linear_light(capture, frame, tone), window, tone)
 
-    def cost(self, thresholds: FixedThresholds) -> float:
+    def __call__(self, thresholds: FixedThresholds) -> float:
         path = self.motion.path(self.window_us, np.array([sum(self.window_us) // 2]), thresholds)
         sharp = self.tone.encode(latent(self.light, path, 0).clamp(0, 1))
-        where = _grown(path.log_mean != 0)
+        where = _dilated(path.log_mean != 0)
         return edge_density(luma(sharp)[..., None], where) + distance_from_usual(thresholds)
 
 
-def _grown(moved: Bool[Tensor, "h w c"]) -> Bool[Tensor, "h w 1"]:
-    """Pixels within two of one that moved, in any colour."""
+def _dilated(moved: Bool[Tensor, "h w c"]) -> Bool[Tensor, "h w 1"]:
+    """Pixels within two of one with events in its exposure, in any colour."""
     any_colour = moved.any(-1).float()[None, None]
     return nn.functional.max_pool2d(any_colour, 5, 1, 2)[0, 0, ..., None] > 0

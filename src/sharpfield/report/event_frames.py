@@ -1,13 +1,13 @@
-"""Event frames: how many events each pixel reported in each window of a stream.
+"""Event frames: the number of events of each pixel in each time window of a stream.
 
 A folder of them holds
 
-    counts.npy      int32 [n h w 2]: darker and brighter, all that happened
-    frames.npy      int32 [n h w]: brighter minus darker, without few events if that is asked
-    0000.png ...    the same as images: red brighter, blue darker, one scale for all
-    frames.mp4      the images one after another
+    counts.npy      int32 [n h w 2]: all events, darker and brighter
+    frames.npy      int32 [n h w]: brighter minus darker, optionally without low counts
+    0000.png ...    frames.npy as images: red brighter, blue darker, one scale for all
+    frames.mp4      the images as a video
 
-Source: EvDNeRF (WACV 2024), whose figures leave out pixels with few events (`without_few`).
+Source: EvDNeRF (WACV 2024), whose figures leave out pixels with few events (`without_low_counts`).
 """
 
 import itertools
@@ -23,24 +23,24 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing_folder
 from sharpfield.events.image import splat_nearest
-from sharpfield.report.colormaps import FULL, colour_signs
+from sharpfield.report.colormaps import FULL_PERCENTILE, colour_signs
 from sharpfield.report.video import Image, write_video
 from sharpfield.storage.images import write_image
 
 COUNTS, FRAMES, VIDEO = "counts.npy", "frames.npy", "frames.mp4"
 
 PUBLISHED_SHARE = 0.3
-"""Least share of a frame's largest count that the published figures show."""
+"""Smallest share of the largest count of a frame that the published figures show."""
 
 RATE = 20.0
 """Windows per second of the video."""
 
 Append = Callable[[Int32[np.ndarray, "h w 2"]], None]
-"""Takes the counts of the next window."""
+"""Appends the counts of the next window."""
 
 
 def count_events(events: EventStream) -> Int32[np.ndarray, "h w 2"]:
-    """How many events got darker and brighter at each pixel; rectified ones at the nearest."""
+    """Number of events to darker and to brighter at each (nearest) pixel."""
     xy = np.stack([events.x, events.y], -1).astype(np.float32)
     value = np.stack([events.p < 0, events.p > 0], -1).astype(np.float64)
     total = splat_nearest(xy, value, width=events.width, height=events.height)
@@ -48,26 +48,26 @@ def count_events(events: EventStream) -> Int32[np.ndarray, "h w 2"]:
 
 
 def signed(counts: Int32[np.ndarray, "*n h w 2"]) -> Int32[np.ndarray, "*n h w"]:
-    """Brighter minus darker."""
+    """Count of events to brighter minus those to darker."""
     return counts[..., 1] - counts[..., 0]
 
 
-def without_few(
+def without_low_counts(
     frames: Int32[np.ndarray, "*n h w"], least_share: float
 ) -> Int32[np.ndarray, "*n h w"]:
-    """Frames without pixels whose count is a small share of the largest in their frame.
+    """Frames with counts set to zero that are a small share of the largest in their frame.
 
     Args:
         frames: Signed counts.
-        least_share: Smallest share that is kept; `PUBLISHED_SHARE` is what the released images
-            of EvDNeRF show, 0 keeps all.
+        least_share: Smallest share that is kept; `PUBLISHED_SHARE` as in the released images of
+            EvDNeRF, 0 keeps all.
     """
-    most = np.abs(frames).max((-2, -1), keepdims=True)
-    return np.where(np.abs(frames) >= least_share * most, frames, 0).astype(np.int32)
+    largest = np.abs(frames).max((-2, -1), keepdims=True)
+    return np.where(np.abs(frames) >= least_share * largest, frames, 0).astype(np.int32)
 
 
 def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
-    """Times at which windows end; the last one may be shorter."""
+    """End times of consecutive windows; the last window may be shorter."""
     if length_us < 1:
         raise OptionError("windows must have a length", got=f"{length_us} us")
     return [*range(start_us + length_us, end_us, length_us), end_us]
@@ -75,28 +75,28 @@ def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
 
 @contextmanager
 def writing_frames(folder: Path, number: int, *, least_share: float = 0.0) -> Iterator[Append]:
-    """What takes the counts of each window; the folder appears whole, at the end, or not at all.
+    """Gives a function that appends the counts of a window.
 
-    Memory is that of one frame: arrays grow on disk, and images, which share a scale, are drawn
-    at the end.
+    The folder appears complete, at the end, or not at all. Only one frame is in memory: arrays are
+    written to disk as they come; images, which share a scale, are drawn at the end.
 
     Args:
         folder: Replaced if it holds event frames.
-        number: Of windows; as many must come.
-        least_share: See `without_few`; of frames and images, not of counts.
+        number: Number of windows; exactly as many must be appended.
+        least_share: See `without_low_counts`; applies to frames and images, not to counts.
 
     Raises:
-        OptionError: The folder is there and holds something else.
+        OptionError: The folder exists and holds something else.
     """
     if folder.exists() and not (folder / COUNTS).is_file():
         raise OptionError(
-            "will not replace a folder that holds other things than event frames",
+            "will not replace a folder that holds other files than event frames",
             where=folder,
             do="choose another name for the events, or move it away",
         )
     with replacing_folder(folder) as temporary:
         arrays: list[np.memmap] = []
-        found = [np.zeros(1, np.int64)]
+        histogram = [np.zeros(1, np.int64)]
         done = itertools.count()
 
         def append(counts: Int32[np.ndarray, "h w 2"]) -> None:
@@ -104,15 +104,15 @@ def writing_frames(folder: Path, number: int, *, least_share: float = 0.0) -> It
                 shapes = {COUNTS: (number, *counts.shape), FRAMES: (number, *counts.shape[:2])}
                 arrays.extend(_on_disk(temporary / name, shape) for name, shape in shapes.items())
             at = next(done)
-            frame = without_few(signed(counts), least_share)
+            frame = without_low_counts(signed(counts), least_share)
             arrays[0][at], arrays[1][at] = counts, frame
-            found[0] = _added(found[0], np.bincount(np.abs(frame).ravel()))
+            histogram[0] = _added(histogram[0], np.bincount(np.abs(frame).ravel()))
 
         yield append
-        assert next(done) == number, "as many windows must come as were announced"
+        assert next(done) == number, "the number of windows differs from the one announced"
         for array in arrays:
             array.flush()
-        _draw(temporary, arrays[1], _full(found[0]))
+        _draw(temporary, arrays[1], _full(histogram[0]))
 
 
 def _on_disk(path: Path, shape: tuple[int, ...]) -> np.memmap:
@@ -128,11 +128,11 @@ def _added(a: Int64[np.ndarray, "n"], b: Int64[np.ndarray, "m"]) -> Int64[np.nda
 
 
 def _full(histogram: Int64[np.ndarray, "n"]) -> float:
-    """`busy` of the frames that a histogram of absolute counts was made of."""
-    ends = np.cumsum(np.concatenate([[0], histogram[1:]]))  # busy pixels up to each count
+    """`full_count` of the frames with this histogram of absolute counts."""
+    ends = np.cumsum(np.concatenate([[0], histogram[1:]]))  # active pixels up to each count
     if not ends[-1]:
         return 1.0
-    rank = FULL / 100 * (ends[-1] - 1)
+    rank = FULL_PERCENTILE / 100 * (ends[-1] - 1)
     low, high = np.searchsorted(ends, [floor(rank), ceil(rank)], "right")
     return float(low + (rank - floor(rank)) * (high - low))
 
@@ -149,7 +149,7 @@ def _draw(folder: Path, frames: Int32[np.ndarray, "n h w"], full: float) -> None
     write_video(folder / VIDEO, drawn(), rate=RATE)
 
 
-def busy(frames: Int32[np.ndarray, "*n h w"]) -> float:
-    """The count that gets the full colour: high among the pixels where something happened."""
-    some = np.abs(frames[frames != 0])
-    return float(np.percentile(some, FULL)) if len(some) else 1.0
+def full_count(frames: Int32[np.ndarray, "*n h w"]) -> float:
+    """The count that gets the full colour: a high percentile over the pixels with events."""
+    active = np.abs(frames[frames != 0])
+    return float(np.percentile(active, FULL_PERCENTILE)) if len(active) else 1.0

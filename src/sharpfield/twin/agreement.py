@@ -21,7 +21,7 @@ from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.metrics.image import relative_count_error
 from sharpfield.report.colormaps import colour_signs
-from sharpfield.report.event_frames import busy, count_events, signed
+from sharpfield.report.event_frames import count_events, full_count, signed
 
 MOST_COUNT = 20
 """Counts of a pixel and window are clipped to this before they are compared as images."""
@@ -108,7 +108,7 @@ def side_by_side(
     chosen = int(np.argmax(np.diff(starts)))
     window = edges_us[chosen], edges_us[chosen + 1]
     frames = [signed(count_events(part.window(*window))) for part in (recorded, predicted)]
-    full = busy(frames[0])
+    full = full_count(frames[0])
     left, right = (colour_signs(frame, full) for frame in frames)
     gap = np.full((left.shape[0], GAP_PX, 3), 255, np.uint8)
     return np.concatenate([left, gap, right], 1)

@@ -105,16 +105,16 @@ def hole_in_path(capture: Capture) -> Capture:
 
 
 PLANTED: dict[str, tuple[Callable[[Capture], Capture], str, str]] = {
-    "ns taken for us": (nanoseconds, "time-unit", "event times look like ns"),
+    "ns read as us": (nanoseconds, "time-unit", "event times look like ns"),
     "frames shifted 20 ms": (frames_late, "time-shift", "ms too late"),
     "x and y swapped": (swapped, "axes-swapped", "x and y"),
-    "x and y swapped inside": (swapped_inside, "axes-swapped", "x and y exchanged"),
+    "x and y swapped inside": (swapped_inside, "axes-swapped", "x and y swapped"),
     "polarity flipped": (flipped, "polarity-flipped", "polarity flipped"),
     "mirrored": (mirrored, "mirrored", "x mirrored"),
     "wrong focal length": (wrong_focal, "focal-length", "focal length"),
-    "saturated sensor": (readout_limit, "events-saturated", "limit of its readout"),
-    "overexposed": (overexposed, "frames-saturated", "white"),
-    "half the trajectory missing": (hole_in_path, "poses-missing", "hole"),
+    "saturated sensor": (readout_limit, "events-saturated", "saturated"),
+    "overexposed": (overexposed, "frames-saturated", "overexposed"),
+    "half the trajectory missing": (hole_in_path, "poses-missing", "gap"),
 }
 
 

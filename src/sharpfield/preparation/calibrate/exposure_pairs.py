@@ -1,21 +1,21 @@
-"""What frames say happened between two exposures, and what events say of the same.
+"""The change of log light between two exposures, by the frames and by the events.
 
-The events of a pixel between the openings of two shutters, and those during both exposures, say
-what the ratio of the two blurred values is:
+The events of a pixel between the openings of two shutters, and those during both exposures,
+predict the ratio of the two blurred values:
 
     log B_j - log B_i  =  E(open_j) - E(open_i)  +  m_j - m_i
 
-with E the change of log light since a first instant and m the log of the mean of exp(E) over an
-exposure, relative to its opening (see `formation.edi`). Nothing has to be sharp, and no scene has
-to be known. One equation belongs to one *site*, a place that reports events.
+with E the change of log light since a reference time and m the log of the mean of exp(E) over an
+exposure, relative to its opening (see `events.edi`). Neither a sharp image nor a scene is needed.
+Each *site*, a position that reports events, gives one equation.
 
-Two things make counts of events fall behind the light; both are made part of the equations.
+Two effects make event counts smaller than the change of light; both are terms of the equations.
 
-- After its last event the light went on by a part of a threshold, most often the same way. So the
-  equation also holds the sign of the last event and that of the next one, averaged over each
-  exposure: its *surroundings*.
-- A pixel is blind for its dead time after an event. Of two events of one sign that are `dt` apart,
-  the second stands for `dt / (dt - dead time)` thresholds.
+- Since its last event the light has changed by a part of a threshold, most often in the same
+  direction. So the equation also has the polarity of the last event and of the next one, averaged
+  over each exposure.
+- A pixel is blind for its refractory time after an event. Of two events of one polarity that are
+  `dt` apart, the second counts for `dt / (dt - refractory time)` thresholds.
 """
 
 import math
@@ -35,51 +35,51 @@ from sharpfield.events.index import EventIndex, first_since
 from sharpfield.events.site_colour import site_channels
 from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light, neighbours
 
-MOST_WEIGHT = 4.0
-"""An event right after a dead time stands for no more thresholds than this."""
+MAX_WEIGHT = 4.0
+"""Most thresholds that an event right after a refractory time counts for."""
 
 
 @dataclass(frozen=True)
 class ExposurePair:
-    """Two exposures of one camera, and what its frames say of them."""
+    """Two exposures of one camera, and the change between them by its frames."""
 
     frames: tuple[int, int]
-    """The earlier and the later one."""
+    """Indices of the earlier and the later frame."""
     windows_us: Int64[np.ndarray, "2 2"]
-    """Opening and closing of each."""
+    """Opening and closing time of each."""
     change: Float64[np.ndarray, "h w c"]
     """log B_j - log B_i: of luma, or of each colour behind a colour filter."""
     usable: Bool[np.ndarray, "h w c"]
     """Where both values are neither too dark nor saturated."""
 
-    def later(self, by_us: int) -> "ExposurePair":
-        """The same images, taken at another time."""
+    def shifted(self, by_us: int) -> "ExposurePair":
+        """The same images with later times."""
         return ExposurePair(self.frames, self.windows_us + by_us, self.change, self.usable)
 
 
 @dataclass(frozen=True)
-class ReaderOptions:
-    """What the events of each site tell of one pair."""
+class EventChange:
+    """The change at each site between the exposures of a pair, by the events."""
 
     expected: Float64[np.ndarray, "m"]
-    """Change of log light, as far as events count."""
+    """Change of log light, without the part since the last event."""
     count: Float64[np.ndarray, "m 2"]
-    """Thresholds crossed to darker and to brighter, between the two openings."""
+    """Thresholds crossed to darker and to brighter between the two openings."""
     last: Float64[np.ndarray, "m"]
-    """Mean sign of the last event, of the second exposure minus the first."""
+    """Mean polarity of the last event, second exposure minus first."""
     next: Float64[np.ndarray, "m"]
-    """And of the next event."""
+    """Mean polarity of the next event, second exposure minus first."""
 
 
 def exposure_pairs(
     capture: Capture, *, most: int, encoding: str | None = None
 ) -> list[ExposurePair]:
-    """Pairs of consecutive exposures whose events are all there, spread over the capture.
+    """Pairs of consecutive exposures that are covered by events, spread over the capture.
 
     Args:
         capture: With frames and events.
-        most: How many pairs.
-        encoding: How stored values relate to light, if not as the frames say.
+        most: Largest number of pairs.
+        encoding: Relation of stored values to light, if not that of the frames.
 
     Raises:
         CaptureError: There are no events, or not two frames of one camera.
@@ -105,7 +105,7 @@ def at_sites(
     index: EventIndex,
     sites: Int64[np.ndarray, "m"],
 ) -> Shaped[np.ndarray, "m"]:
-    """A map over the pixels, looked up at some sites: the nearest pixel, the site's colour."""
+    """Values of a map at some sites: at the nearest pixel, in the colour of the site."""
     x, y = np.rint(index.site_xy[sites]).astype(np.int64).T
     height, width, _ = values.shape
     channels = site_channels(capture.needed_events, index)
@@ -113,29 +113,31 @@ def at_sites(
     return values[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1), channel]
 
 
-def told(
+def change_by_events(
     index: EventIndex,
     weight: Float64[np.ndarray, "n"],
     pair: ExposurePair,
     sites: Int64[np.ndarray, "m"],
     thresholds: tuple[float, float],
-) -> ReaderOptions:
-    """What the events of some sites tell of a pair.
+) -> EventChange:
+    """The change at some sites between the exposures of a pair, by the events.
 
     Args:
         index: All events by site.
-        weight: Thresholds that each event of the index stands for.
+        weight: Number of thresholds that each event of the index counts for.
         pair: The two exposures.
-        sites: Of the camera that exposed.
+        sites: Sites of the camera of the frames.
         thresholds: To darker and to brighter.
     """
     found = np.zeros((len(sites), 5))
-    _tell(*(sites, index.offset, index.t_us, index.p, weight, pair.windows_us, thresholds, found))
-    return ReaderOptions(found[:, 0], found[:, 1:3], found[:, 3], found[:, 4])
+    _sum_events(
+        *(sites, index.offset, index.t_us, index.p, weight, pair.windows_us, thresholds, found)
+    )
+    return EventChange(found[:, 0], found[:, 1:3], found[:, 3], found[:, 4])
 
 
 def weights(index: EventIndex, dead_us: float) -> Float64[np.ndarray, "n"]:
-    """Thresholds that each event stands for, if pixels are blind for a time after an event."""
+    """Number of thresholds that each event counts for, given the refractory time of the pixels."""
     found = np.ones(len(index))
     if dead_us > 0:
         _weigh(index.offset, index.t_us, index.p, dead_us, found)
@@ -159,13 +161,13 @@ def _weigh(offset, t_us, p, dead_us, weight):
         for i in range(offset[site] + 1, offset[site + 1]):
             if p[i] == p[i - 1]:
                 apart = t_us[i] - t_us[i - 1]
-                if apart > dead_us:  # what comes sooner has not been told by that rule
-                    weight[i] = min(apart / (apart - dead_us), MOST_WEIGHT)
+                if apart > dead_us:  # an event within the refractory time contradicts the model
+                    weight[i] = min(apart / (apart - dead_us), MAX_WEIGHT)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _tell(sites, offset, t_us, p, weight, windows_us, thresholds, found):
+def _sum_events(sites, offset, t_us, p, weight, windows_us, thresholds, found):
     for site in range(len(sites)):
         first, last = offset[sites[site]], offset[sites[site] + 1]
         start = first_since(t_us, first, last, windows_us[0, 0] + 1)

@@ -1,7 +1,7 @@
-"""Contrast thresholds of an event camera, measured from any capture that has frames as well.
+"""Contrast thresholds of an event camera, measured from a capture with frames and events.
 
-What the frames say changed between two exposures is set against what the events say, for every
-pixel (see `threshold_fit`). The uncertainty is a bootstrap over tiles of pixels and pairs.
+The change of log light between two exposures by the frames is regressed on that by the events, for
+every pixel (see `threshold_fit`). The uncertainty is a bootstrap over tiles of pixels and pairs.
 """
 
 from dataclasses import dataclass
@@ -33,82 +33,85 @@ from sharpfield.preparation.options import CalibrateOptions
 ROUNDS = 8
 """Gauss-Newton steps."""
 
-LEAST_EQUATIONS, MOST_EQUATIONS = 200, 200_000
-LEAST_CHANGE = 0.02
+MIN_EQUATIONS, MAX_EQUATIONS = 200, 200_000
+MIN_CHANGE = 0.02
 """Mean absolute change of log light below which nothing moved."""
 
-MODEL = 0.015
-"""What the terms leave out of a sensor, as a share of a threshold: root mean square of the errors
-on simulated sensors, which the draws do not show."""
+MODEL_ERROR = 0.015
+"""Error of the sensor model as a share of the threshold: RMS error on simulated sensors, which the
+bootstrap does not include."""
 
-ENOUGH = 4.0
-"""Events of a pixel must say so many standard deviations of change for it to be judged."""
+MIN_SIGNAL = 4.0
+"""A pixel is measured if the change by its events is so many standard deviations."""
 
-SURE = 5.0
-OFF_BY = 0.35
-"""A deviating pixel is off by so many standard deviations, and by this share of the threshold."""
+MIN_SIGMAS, MIN_DEVIATION = 5.0, 0.35
+"""A deviating pixel differs by so many standard deviations and by this share of the threshold."""
 
 
 @dataclass(frozen=True)
-class Calibration:
-    """Thresholds with their uncertainty, and pixels that differ."""
+class ThresholdCalibration:
+    """Thresholds with their uncertainty, and maps of single pixels."""
 
     negative: float
+    """Threshold of events to darker; natural log."""
     positive: float
+    """Threshold of events to brighter; natural log."""
     negative_sigma: float
     """One standard deviation."""
     positive_sigma: float
     dead_us: float
-    """Dead time of a pixel after an event."""
+    """Refractory time of a pixel after an event."""
     late_ms: float
-    """By how much events come later than the light of the frames changes."""
+    """Latency of the events relative to the frames."""
     explained: float
-    """Correlation of what the events say with what the frames saw."""
+    """Correlation of the changes by events with those by frames."""
     residual: float
     """Robust standard deviation of the difference, natural log."""
     drift: float
-    """Change of log light per pair that no event accounts for: gain of the frames, or leak."""
+    """Change of log light per pair that no event explains: gain of the frames, or leak events."""
     equations: int
+    """Number of equations: usable sites of all pairs."""
     pairs: int
+    """Number of exposure pairs."""
     ratio: Float32[np.ndarray, "h w"]
-    """Threshold of each pixel over the common one; NaN where too little happened to tell."""
+    """Threshold of each pixel over the common one; NaN where there is too little signal."""
     deviating: Bool[np.ndarray, "h w"]
-    """Pixels that surely differ by more than `OFF_BY`."""
+    """Pixels whose threshold differs significantly, by more than `MIN_DEVIATION`."""
     dead: Bool[np.ndarray, "h w"]
-    """Without any event although the frames changed."""
+    """Pixels without events although their neighbours have some."""
     hot: Bool[np.ndarray, "h w"]
-    """With many more events than the pixels around them."""
+    """Pixels with many more events than their neighbours."""
 
 
-def calibrate(capture: Capture, options: CalibrateOptions) -> Calibration:
+def calibrate(capture: Capture, options: CalibrateOptions) -> ThresholdCalibration:
     """Measure thresholds.
 
     Args:
-        capture: With frames and events of the same pixels; poses are not looked at.
-        options: How much to look at.
+        capture: With frames and events of the same pixels; poses are not used.
+        options: Options.
 
     Raises:
-        CaptureError: Frames or events are missing, or nothing moved.
+        CaptureError: Frames or events are missing, or too little changed.
     """
     index = build_index(capture.needed_events)
     pairs = exposure_pairs(capture, most=options.pairs)
     _, hot = odd_pixels(counts(capture.needed_events))
     every = Equations.of(capture, index, pairs, without=hot)
-    some = Equations.of(capture, index, pairs, without=hot, most=MOST_EQUATIONS)
+    some = Equations.of(capture, index, pairs, without=hot, most=MAX_EQUATIONS)
     some = with_events_around(some)
-    if len(some.seen) < LEAST_EQUATIONS or np.abs(some.seen).mean() < LEAST_CHANGE:
+    if len(some.change) < MIN_EQUATIONS or np.abs(some.change).mean() < MIN_CHANGE:
         raise CaptureError(
             "too little changed between frames to measure thresholds",
             where=capture.name,
-            got=f"{len(some.seen)} usable pixels with events",
-            do="record something that moves, neither too dark nor saturated",
+            got=f"{len(some.change)} usable pixels with events",
+            do="record a moving scene or camera, neither under- nor overexposed",
         )
     longest, fit = longest_dead_us(index), Fit.at(some, START)
     for _ in range(ROUNDS):
         fit = Fit.at(some, Normal.of(some, fit).step(fit.terms, longest))
     draw = numpy_generator(options.seed, 0, "calibrate")
-    sigma = np.hypot(Normal.of(some, fit).spread(fit.terms, longest, draw), MODEL * fit.terms)
-    return Calibration(
+    sigma = np.hypot(Normal.of(some, fit).spread(fit.terms, longest, draw), MODEL_ERROR * fit.terms)
+    return ThresholdCalibration(
         negative=float(fit.terms[NEGATIVE]),
         positive=float(fit.terms[POSITIVE]),
         negative_sigma=float(sigma[NEGATIVE]),
@@ -116,9 +119,9 @@ def calibrate(capture: Capture, options: CalibrateOptions) -> Calibration:
         dead_us=float(fit.terms[DEAD_US]),
         late_ms=float(fit.terms[LATE_MS]),
         explained=fit.explained,
-        residual=1.4826 * float(np.median(np.abs(fit.left))),
+        residual=1.4826 * float(np.median(np.abs(fit.residual))),
         drift=float(fit.terms[DRIFT]),
-        equations=len(some.seen),
+        equations=len(some.change),
         pairs=len(pairs),
         **_pixels(capture, every, Fit.at(every, fit.terms)),
     )
@@ -127,19 +130,19 @@ def calibrate(capture: Capture, options: CalibrateOptions) -> Calibration:
 def _pixels(
     capture: Capture, equations: Equations, fit: Fit
 ) -> dict[str, Shaped[np.ndarray, "h w"]]:
-    """Maps of what single pixels do, by the equations of each."""
+    """Maps of the pixels, from the equations of each."""
     width, height = capture.camera.size
-    at = np.concatenate(equations.place)
-    scale = 1.4826 * float(np.median(np.abs(fit.left)))
+    at = np.concatenate(equations.pixel)
+    scale = 1.4826 * float(np.median(np.abs(fit.residual)))
 
     def total(values: Float64[np.ndarray, "e"]) -> Float64[np.ndarray, "h w"]:
         return np.bincount(at, values, minlength=width * height).reshape(height, width)
 
-    events_say = total(fit.expected**2)
-    enough = events_say > (ENOUGH * scale) ** 2
-    ratio = total(equations.seen * fit.expected) / np.where(enough, events_say, 1)
-    sigma = scale / np.sqrt(np.where(enough, events_say, 1))
-    off = (np.abs(ratio - 1) > SURE * sigma) & (np.abs(ratio - 1) > OFF_BY)
+    by_events = total(fit.expected**2)
+    enough = by_events > (MIN_SIGNAL * scale) ** 2
+    ratio = total(equations.change * fit.expected) / np.where(enough, by_events, 1)
+    sigma = scale / np.sqrt(np.where(enough, by_events, 1))
+    off = (np.abs(ratio - 1) > MIN_SIGMAS * sigma) & (np.abs(ratio - 1) > MIN_DEVIATION)
     dead, hot = odd_pixels(counts(capture.needed_events))
     return {
         "ratio": np.where(enough, ratio, np.nan).astype(np.float32),

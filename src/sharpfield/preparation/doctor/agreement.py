@@ -1,9 +1,9 @@
-"""Do frames and events tell of the same light? If not, which mistake would make them?
+"""Check that frames and events agree, and find flipped axes, flipped polarity or a time shift.
 
-What the frames say changed between two exposures is compared with what the events say (see
-`exposure_pairs`), by their correlation over the pixels. It is also compared for every way to
-mirror, turn or swap the coordinates of the events, for the other polarity, and for other times of
-the frames: the mistake that makes them agree is the one that was made.
+The change of log light between two exposures is computed from the frames and from the events (see
+`exposure_pairs`); their agreement is the correlation over the pixels. It is computed for all flips
+and swaps of the event coordinates, for the other polarity, and for other times of the frames: the
+variant that agrees clearly better shows the mistake.
 """
 
 from dataclasses import dataclass
@@ -14,28 +14,35 @@ from jaxtyping import Bool, Float64, UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.events.index import EventIndex, build_index
-from sharpfield.preparation.calibrate.exposure_pairs import ExposurePair, exposure_pairs, told
+from sharpfield.preparation.calibrate.exposure_pairs import (
+    ExposurePair,
+    change_by_events,
+    exposure_pairs,
+)
 from sharpfield.preparation.doctor.findings import Checkup, Curve
+from sharpfield.report.colormaps import colour_signs
 
 PAIRS = 5
-FARTHEST_US, COARSE_US, FINE_US = 60_000, 6_000, 1_000
-"""Other times of the frames: how far, in which steps, and how finely around the best."""
+MAX_SHIFT_US, COARSE_US, FINE_US = 60_000, 6_000, 1_000
+"""Time shifts of the frames: the largest, the coarse step, and the fine step around the best."""
 SHIFT_US, SHIFT_GAIN = 6_000, 0.03
-"""A shift counts from this on, if the correlation gains so much."""
+"""A shift is reported from this on, if the correlation gains so much."""
 LATENCY_US, CLEAR_GAIN = 10_000, 0.1
-"""Shorter ones that gain less may be the pixels: in dim light they report some ms late."""
+"""A shorter shift that gains less may be the latency of the pixels, some ms in dim light."""
 AGREES, BETTER = 0.4, 0.15
-"""Correlation from which on two things agree; and what another arrangement must have on top."""
+"""Correlation from which on frames and events agree, and what another axis convention must gain."""
 POOR = 0.6
+"""Correlation below which the agreement is a warning."""
 LAST, NEXT = 0.3, 0.25
-"""Parts of a threshold by which light usually is ahead of its last event, and near its next."""
-SMALL = 0.2
-"""Thresholds do not matter to a correlation, as long as both are alike; nor do lesser changes."""
+"""Typical change since the last event and before the next one, in thresholds."""
+THRESHOLD = 0.2
+"""Threshold of both polarities, which a correlation does not depend on; smaller changes are
+ignored."""
 
 
 @dataclass(frozen=True)
-class Arrangement:
-    """How the events would have to be changed."""
+class AxisConvention:
+    """How coordinates and polarity of the events would have to be changed."""
 
     transposed: bool = False
     mirrored_x: bool = False
@@ -45,9 +52,9 @@ class Arrangement:
 
     @property
     def name(self) -> str:
-        """In words; nothing if nothing is changed."""
+        """In words; empty if nothing is changed."""
         parts = [
-            "x and y exchanged" * self.transposed,
+            "x and y swapped" * self.transposed,
             "x mirrored" * self.mirrored_x,
             "y mirrored" * self.mirrored_y,
             "polarity flipped" * self.flipped,
@@ -56,8 +63,8 @@ class Arrangement:
 
     @property
     def flags(self) -> str:
-        """The options of `sharpfield ingest` that undo it."""
-        # `said` is read at the mirrored place after it was transposed, as `ingest` mends it
+        """The options of `sharpfield ingest` that correct it."""
+        # Mirrored after it was transposed, in the order in which `ingest` corrects it.
         parts = [
             "--swap-xy" * self.transposed,
             "--flip-x" * self.mirrored_x,
@@ -68,70 +75,77 @@ class Arrangement:
 
     def score(
         self,
-        seen: Float64[np.ndarray, "n h w"],
-        said: Float64[np.ndarray, "n h w"],
+        from_frames: Float64[np.ndarray, "n h w"],
+        from_events: Float64[np.ndarray, "n h w"],
         usable: Bool[np.ndarray, "n h w"],
     ) -> float:
-        """Correlation of what frames saw with what the events say, so changed."""
+        """Correlation of the changes by frames with those by events in this convention."""
         if self.transposed:
-            side = min(said.shape[1:])
-            said = said[:, :side, :side].swapaxes(1, 2)
-            seen, usable = seen[:, :side, :side], usable[:, :side, :side]
+            side = min(from_events.shape[1:])
+            from_events = from_events[:, :side, :side].swapaxes(1, 2)
+            from_frames, usable = from_frames[:, :side, :side], usable[:, :side, :side]
         if self.mirrored_x:
-            said = said[:, :, ::-1]
+            from_events = from_events[:, :, ::-1]
         if self.mirrored_y:
-            said = said[:, ::-1]
-        good = usable & ((said != 0) | (np.abs(seen) > SMALL))
-        if good.sum() < 100 or said[good].std() == 0 or seen[good].std() == 0:
+            from_events = from_events[:, ::-1]
+        good = usable & ((from_events != 0) | (np.abs(from_frames) > THRESHOLD))
+        if good.sum() < 100 or from_events[good].std() == 0 or from_frames[good].std() == 0:
             return 0.0
-        found = float(np.corrcoef(np.clip(seen[good], -2, 2), np.clip(said[good], -2, 2))[0, 1])
+        found = float(
+            np.corrcoef(np.clip(from_frames[good], -2, 2), np.clip(from_events[good], -2, 2))[0, 1]
+        )
         return -found if self.flipped else found
 
 
-AS_IS = Arrangement()
-ARRANGEMENTS = [Arrangement(*parts) for parts in product((False, True), repeat=4)]
+AS_IS = AxisConvention()
+CONVENTIONS = [AxisConvention(*parts) for parts in product((False, True), repeat=4)]
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """How frames and events go together."""
+class FrameEventAgreement:
+    """How well frames and events agree."""
 
     correlation: float
-    """As they are."""
-    best: Arrangement
+    """With the events as they are."""
+    best: AxisConvention
     shift_us: int
-    """Added to the times of frames, it makes them agree best."""
+    """Time shift of the frames with the best agreement."""
     best_correlation: float
     unshifted: float
-    """Correlation of the best arrangement at the times that frames have."""
+    """Correlation of the best convention without a time shift."""
 
 
-def check_agreement(capture: Capture, checkup: Checkup) -> Agreement | None:
+def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement | None:
     """Compare frames with events; None if they cannot be compared."""
     frames = capture.needed_frames
     if len(frames) < 2 or len(np.unique(frames.track)) == len(frames):
-        checkup.say("note", "agreement", "single frames cannot be compared with events")
+        checkup.add("note", "agreement", "a single frame cannot be compared with events")
         return None
     index = build_index(capture.needed_events)
     pairs = exposure_pairs(capture, most=PAIRS)
-    seen = np.stack([_luma_change(pair) for pair in pairs])
+    from_frames = np.stack([_luma_change(pair) for pair in pairs])
     usable = np.stack([pair.usable.all(-1) for pair in pairs])
-    shifts = np.arange(-FARTHEST_US, FARTHEST_US + 1, COARSE_US)
+    shifts = np.arange(-MAX_SHIFT_US, MAX_SHIFT_US + 1, COARSE_US)
     scores = np.array(
         [
-            [one.score(seen, said, usable) for one in ARRANGEMENTS]
-            for said in (_said(capture, index, pairs, int(shift)) for shift in shifts)
+            [one.score(from_frames, from_events, usable) for one in CONVENTIONS]
+            for from_events in (
+                _changes_by_events(capture, index, pairs, int(shift)) for shift in shifts
+            )
         ]
     )
     now = float(scores[len(shifts) // 2, 0])
     at, which = np.unravel_index(scores.argmax(), scores.shape)
-    best = ARRANGEMENTS[int(which)]
+    best = CONVENTIONS[int(which)]
     if scores.max() < max(scores[:, 0].max() + BETTER, AGREES):
         best, at = AS_IS, int(scores[:, 0].argmax())
     fine = int(shifts[at]) + np.arange(-COARSE_US, COARSE_US + 1, FINE_US)
-    finer = [best.score(seen, _said(capture, index, pairs, int(s)), usable) for s in fine]
-    column = ARRANGEMENTS.index(best)
-    found = Agreement(
+    finer = [
+        best.score(from_frames, _changes_by_events(capture, index, pairs, int(s)), usable)
+        for s in fine
+    ]
+    column = CONVENTIONS.index(best)
+    found = FrameEventAgreement(
         now,
         best,
         int(fine[int(np.argmax(finer))]),
@@ -141,30 +155,30 @@ def check_agreement(capture: Capture, checkup: Checkup) -> Agreement | None:
     order = np.argsort(np.concatenate([shifts, fine]))
     checkup.curves.append(
         Curve(
-            "Correlation of events with frames, were frames taken later",
+            "Correlation of events with frames, for other times of the frames",
             "shift of the frames, ms",
             np.concatenate([shifts, fine])[order] / 1000,
             np.concatenate([scores[:, column], finer])[order],
         )
     )
-    _say(found, checkup)
-    said = _said(capture, index, pairs[:1], 0)[0]
-    checkup.images["what the frames say changed between two exposures"] = _signs(seen[0])
-    checkup.images["what the events say changed"] = _signs(said)
+    _add_findings(found, checkup)
+    from_events = _changes_by_events(capture, index, pairs[:1], 0)[0]
+    checkup.images["change between two exposures, by the frames"] = _signed_image(from_frames[0])
+    checkup.images["change between two exposures, by the events"] = _signed_image(from_events)
     return found
 
 
-def _say(found: Agreement, checkup: Checkup) -> None:
+def _add_findings(found: FrameEventAgreement, checkup: Checkup) -> None:
     shifted = (
         abs(found.shift_us) >= SHIFT_US and found.best_correlation > found.unshifted + SHIFT_GAIN
     )
     got = f"correlation {found.correlation:.2f}"
     if found.best_correlation < AGREES:
-        checkup.say(
+        checkup.add(
             "error",
             "disagreement",
-            "events do not explain what changed between frames",
-            got=f"{got}; no mirroring, swapping or shift by up to {FARTHEST_US // 1000} ms helps",
+            "events do not explain the change between frames",
+            got=f"{got}; no flip, swap or time shift of up to {MAX_SHIFT_US // 1000} ms helps",
             do="check that both files are of the same recording, and the encoding of the frames",
         )
         return
@@ -172,12 +186,12 @@ def _say(found: Agreement, checkup: Checkup) -> None:
     if found.best != AS_IS:
         name = (
             "polarity-flipped"
-            if found.best == Arrangement(flipped=True)
+            if found.best == AxisConvention(flipped=True)
             else "axes-swapped"
             if found.best.transposed
             else "mirrored"
         )
-        checkup.say(
+        checkup.add(
             "error",
             name,
             f"the events have {found.best.name}",
@@ -185,26 +199,26 @@ def _say(found: Agreement, checkup: Checkup) -> None:
             do=f"ingest again with {found.best.flags}",
         )
     if shifted:
-        _say_shift(found, better, checkup)
+        _add_shift(found, better, checkup)
     if found.best == AS_IS and not shifted:
         poor = found.correlation < POOR
-        checkup.say(
+        checkup.add(
             "warning" if poor else "note",
             "agreement",
-            "events explain what changed between frames" + (" only in part" if poor else ""),
+            "events explain the change between frames" + (" only in part" if poor else ""),
             got=got,
             do="check thresholds, noise and saturation" if poor else "",
         )
 
 
-def _say_shift(found: Agreement, better: str, checkup: Checkup) -> None:
+def _add_shift(found: FrameEventAgreement, better: str, checkup: Checkup) -> None:
     gain = found.best_correlation - found.unshifted
     small = abs(found.shift_us) <= LATENCY_US and gain < CLEAR_GAIN
     late = -found.shift_us / 1000
     do = f"ingest with --offset-ms {-late:g}, or what is given now and {-late:+g}"
     if small:
-        do += "; less than the latency of the pixels is no mistake, and costs little"
-    checkup.say(
+        do += "; a shift below the latency of the pixels is no mistake, and costs little"
+    checkup.add(
         "warning" if small else "error",
         "time-shift",
         f"frame times are {abs(late):.0f} ms too {'late' if late > 0 else 'early'} for the events",
@@ -214,34 +228,31 @@ def _say_shift(found: Agreement, better: str, checkup: Checkup) -> None:
 
 
 def _luma_change(pair: ExposurePair) -> Float64[np.ndarray, "h w"]:
-    """What changed between two exposures, less the gain of the frame."""
+    """Change of log luma between two exposures, without the gain of the frame (median)."""
     change = pair.change.mean(-1)
     usable = pair.usable.all(-1)
     return change - (np.median(change[usable]) if usable.any() else 0.0)
 
 
-def _said(
+def _changes_by_events(
     capture: Capture, index: EventIndex, pairs: list[ExposurePair], shift_us: int
 ) -> Float64[np.ndarray, "n h w"]:
-    """What the events say, as maps over the pixels."""
+    """Changes of log light by the events, as maps over the pixels."""
     width, height = capture.camera.size
-    even, thresholds = np.ones(len(index)), (SMALL, SMALL)
+    even, thresholds = np.ones(len(index)), (THRESHOLD, THRESHOLD)
     maps = []
     for pair in pairs:
         sites = index.sites_of(int(capture.needed_frames.track[pair.frames[0]]))
-        found = told(index, even, pair.later(shift_us), sites, thresholds)
+        found = change_by_events(index, even, pair.shifted(shift_us), sites, thresholds)
         x, y = np.rint(index.site_xy[sites]).astype(np.int64).T
         at = np.clip(y, 0, height - 1) * width + np.clip(x, 0, width - 1)
-        change = found.expected + SMALL * (LAST * found.last + NEXT * found.next)
+        change = found.expected + THRESHOLD * (LAST * found.last + NEXT * found.next)
         total = np.bincount(at, change, minlength=width * height)
         many = np.maximum(np.bincount(at, minlength=width * height), 1)
         maps.append((total / many).reshape(height, width))
     return np.stack(maps)
 
 
-def _signs(change: Float64[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def _signed_image(change: Float64[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Red where it got brighter, blue where darker."""
-    full = max(float(np.percentile(np.abs(change), 95)), 1e-6)
-    strength = np.clip(change / full, -1, 1)[..., None]
-    colour = np.where(strength > 0, np.array((200, 32, 38)), np.array((38, 86, 190)))
-    return np.rint(255 + np.abs(strength) * (colour - 255)).astype(np.uint8)
+    return colour_signs(change, max(float(np.percentile(np.abs(change), 95)), 1e-6))

@@ -1,8 +1,8 @@
-"""A checkup of a capture before hours are spent on it.
+"""Checks of a capture before training on it.
 
-Everything is looked at in the order in which one mistake would hide another: the files, units of
-time, the two sensors by themselves, whether frames and events tell of the same light, and only then
-thresholds, poses and blur. What a mistake makes meaningless is not judged: mend it and look again.
+The order is that in which one mistake would hide another: files, time units, each sensor by itself,
+whether frames and events agree, and only then thresholds, poses and blur. Checks that an earlier
+error makes meaningless are left out: fix it and check again.
 """
 
 from collections.abc import Callable
@@ -23,21 +23,23 @@ from sharpfield.preparation.options import CalibrateOptions
 from sharpfield.preparation.thresholds import known_thresholds
 
 PAIRS = 4
-"""Pairs of exposures for the thresholds: an estimate, not a calibration."""
-FAR_OFF, SIGMAS = 0.15, 3.0
-"""Known thresholds are doubted if they are off by this share, and so many standard deviations."""
-EXPLAINS = 0.5
+"""Pairs of exposures from which thresholds are estimated; fewer than for a calibration."""
+MAX_ERROR, MAX_SIGMAS = 0.15, 3.0
+"""Stated thresholds that differ by more than this share and so many standard deviations are
+reported."""
+MIN_CORRELATION = 0.5
+"""Correlation of events and frames from which on the measured thresholds are trusted."""
 
 READ_CHECKS = {
     "poses do not cover": "poses-missing",
     "not taken at the same time": "time-unit",
     "events lie outside the sensor": "axes-swapped",
 }
-"""What the reader's words mean, in names of checks."""
+"""Names of checks by the error text of the reader."""
 
 
 def examine(capture: Capture) -> Checkup:
-    """Look at everything that is there."""
+    """Run all checks that the capture allows."""
     checkup = Checkup(capture.name)
     in_time = check_units(capture, checkup)
     if capture.frames is not None:
@@ -48,7 +50,7 @@ def examine(capture: Capture) -> Checkup:
         check_pixels(capture, checkup)
     agreed = False
     if aligned and in_time and capture.frames is not None and not checkup.has("error"):
-        agreed = _tried(checkup, "agreement", lambda: _agree(capture, checkup))
+        agreed = _possible(checkup, "agreement", lambda: _agree(capture, checkup))
     if agreed:
         capture = _with_thresholds(capture, checkup)
     posed = in_time and check_poses_known(capture, checkup)
@@ -56,23 +58,23 @@ def examine(capture: Capture) -> Checkup:
         if aligned:
             check_motion(capture, checkup)
         if capture.frames is not None and len(capture.frames) > 1:
-            _tried(checkup, "poses-fit", lambda: check_images(capture, checkup))
+            _possible(checkup, "poses-fit", lambda: check_images(capture, checkup))
             check_blur(capture, checkup)
     elif posed:
-        checkup.say("note", "poses-fit", "poses were not judged: mend the errors first")
+        checkup.add("note", "poses-fit", "poses were not checked: fix the errors first")
     check_hold_out(capture, checkup)
     return checkup
 
 
 def examine_path(path: Path, *, layout: str | None = None) -> tuple[Checkup, Capture | None]:
-    """Read a capture and look at it; what keeps it from being read is a finding, too."""
+    """Read a capture and check it; an error while reading is a finding, too."""
     try:
         capture = read_capture(path, ReadOptions(layout=layout), poses=False)
     except CaptureError as error:
         checkup = Checkup(path.resolve().name)
         names = [name for words, name in READ_CHECKS.items() if words in error.what]
         got = "; ".join(part for part in (error.where, error.got) if part)
-        checkup.say("error", (names or ["unreadable"])[0], error.what, got=got, do=error.do)
+        checkup.add("error", (names or ["unreadable"])[0], error.what, got=got, do=error.do)
         return checkup, None
     return examine(capture), capture
 
@@ -83,44 +85,48 @@ def _agree(capture: Capture, checkup: Checkup) -> bool:
 
 
 def _with_thresholds(capture: Capture, checkup: Checkup) -> Capture:
-    """The capture with thresholds measured where it knows none; says what was measured."""
+    """The capture with thresholds measured where it states none; adds a finding."""
     try:
-        made = calibrate(capture, CalibrateOptions(pairs=PAIRS))
+        measured = calibrate(capture, CalibrateOptions(pairs=PAIRS))
     except CaptureError as error:
-        checkup.say("note", "thresholds", f"thresholds cannot be measured: {error.what}")
+        checkup.add("note", "thresholds", f"thresholds cannot be measured: {error.what}")
         return capture
     got = (
-        f"{made.negative:.3f} +- {made.negative_sigma:.3f} to darker,"
-        f" {made.positive:.3f} +- {made.positive_sigma:.3f} to brighter"
+        f"{measured.negative:.3f} +- {measured.negative_sigma:.3f} to darker,"
+        f" {measured.positive:.3f} +- {measured.positive_sigma:.3f} to brighter"
     )
-    known = known_thresholds(capture)
-    off = known is not None and any(
-        abs(found - said) > max(FAR_OFF * said, SIGMAS * sigma)
-        for found, said, sigma in (
-            (made.negative, known.negative, made.negative_sigma),
-            (made.positive, known.positive, made.positive_sigma),
+    stated = known_thresholds(capture)
+    off = stated is not None and any(
+        abs(value - expected) > max(MAX_ERROR * expected, MAX_SIGMAS * sigma)
+        for value, expected, sigma in (
+            (measured.negative, stated.negative, measured.negative_sigma),
+            (measured.positive, stated.positive, measured.positive_sigma),
         )
     )
-    if off and known is not None and made.explained > EXPLAINS:
-        checkup.say(
+    if off and stated is not None and measured.explained > MIN_CORRELATION:
+        checkup.add(
             "warning",
             "thresholds",
-            "the thresholds that the capture knows are not those that its frames show",
-            got=f"{got}; known {known.negative:.3g} and {known.positive:.3g}",
+            "the stated thresholds differ from those that frames and events show",
+            got=f"{got}; stated {stated.negative:.3g} and {stated.positive:.3g}",
             do="measure them with `sharpfield calibrate`, and give the result with --threshold",
         )
     else:
-        checkup.say("note", "thresholds", "contrast thresholds, by frames and events", got=got)
-    if known is not None or made.explained <= EXPLAINS:
+        checkup.add(
+            "note", "thresholds", "contrast thresholds, estimated from frames and events", got=got
+        )
+    if stated is not None or measured.explained <= MIN_CORRELATION:
         return capture
-    measured = Thresholds(made.negative, made.positive, "estimated")
+    measured = Thresholds(measured.negative, measured.positive, "estimated")
     return replace(capture, known=replace(capture.known, thresholds=measured))
 
 
-def _tried(checkup: Checkup, check: str, look: Callable[[], object]) -> bool:
-    """Look; if the capture holds too little for that, say so."""
+def _possible(checkup: Checkup, check: str, run: Callable[[], object]) -> bool:
+    """Run a check; adds a note if the capture holds too little data for it."""
     try:
-        return bool(look())
+        return bool(run())
     except CaptureError as error:
-        checkup.say("note", check, f"could not be judged: {error.what}", got=error.got, do=error.do)
+        checkup.add(
+            "note", check, f"could not be checked: {error.what}", got=error.got, do=error.do
+        )
         return False

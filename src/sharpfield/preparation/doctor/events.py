@@ -1,7 +1,4 @@
-"""Checks of the two sensors by themselves: rates, saturation, dead and hot pixels, light.
-
-Pixels of an event camera that do nothing, and pixels that never stop.
-"""
+"""Checks of each sensor by itself: event rate, dead and hot pixels, over- and underexposure."""
 
 import numpy as np
 import torch
@@ -13,17 +10,17 @@ from sharpfield.core.events import EventStream
 from sharpfield.preparation.doctor.findings import Checkup
 
 AROUND = 7
-"""Side of the neighbourhood a pixel is compared with."""
+"""Side of the neighbourhood that a pixel is compared with, in px."""
 HOT_TIMES = 8.0
-"""A hot pixel reports so many times as often as the median of its neighbourhood,"""
+"""A hot pixel has so many times the events of the median of its neighbourhood,"""
 HOT_SIGMA = 8.0
-"""and so many standard deviations (of counting) more."""
-BUSY = 30.0
-"""A silent pixel is dead where the median of its neighbourhood is at least so many events."""
+"""and exceeds it by so many standard deviations of a Poisson count."""
+DEAD_MEDIAN = 30.0
+"""A pixel without events is dead where the median of its neighbourhood is at least this."""
 
 
 def counts(events: EventStream) -> Int64[np.ndarray, "h w"]:
-    """Events of each pixel; rectified positions count for the nearest."""
+    """Number of events of each pixel; rectified positions count for the nearest one."""
     x = np.clip(np.rint(events.x).astype(np.int64), 0, events.width - 1)
     y = np.clip(np.rint(events.y).astype(np.int64), 0, events.height - 1)
     flat = np.bincount(y * events.width + x, minlength=events.width * events.height)
@@ -33,10 +30,10 @@ def counts(events: EventStream) -> Int64[np.ndarray, "h w"]:
 def odd_pixels(
     count: Int64[np.ndarray, "h w"],
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Dead and hot pixels, by their counts of events."""
-    usual = _median_around(count)
-    hot = (count > HOT_TIMES * (usual + 1)) & (count > usual + HOT_SIGMA * np.sqrt(usual + 1))
-    return (count == 0) & (usual >= BUSY), hot
+    """Dead and hot pixels, by their event counts."""
+    median = _median_around(count)
+    hot = (count > HOT_TIMES * (median + 1)) & (count > median + HOT_SIGMA * np.sqrt(median + 1))
+    return (count == 0) & (median >= DEAD_MEDIAN), hot
 
 
 def _median_around(count: Int64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"]:
@@ -49,46 +46,49 @@ def _median_around(count: Int64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"
 
 
 WINDOW_US = 1000
-USUAL_MOST = 99
-"""Percentile of windows that tells the limit; single ones may exceed it."""
-TOP, BELOW = 0.97, 0.85
-"""A sensor at its limit piles up windows above `TOP` of that,"""
-PILED, STEEP = 0.08, 2.0
-"""this share of those with events, and so many times as many as between `BELOW` and `TOP`."""
-CROWDED = 0.3
-"""Or this share, whatever is below: even a swing, slowest where it turns, stays at half of it."""
-LEAST_WINDOW = 20
-"""Events in the busiest window; fewer say nothing of a limit."""
+"""Windows in which events are counted to find the readout limit."""
+LIMIT_PERCENTILE = 99
+"""Percentile of the counts of windows that estimates the readout limit."""
+AT_LIMIT, BELOW_LIMIT = 0.97, 0.85
+"""A saturated sensor has many windows above `AT_LIMIT` times the limit:"""
+MIN_SHARE, MIN_RATIO = 0.08, 2.0
+"""at least this share of the windows with events, and so many times as many as between
+`BELOW_LIMIT` and `AT_LIMIT`;"""
+SATURATED_SHARE = 0.3
+"""or this share anyway: a swinging camera, slowest at its turning points, reaches half of it."""
+MIN_EVENTS = 20
+"""Fewer events in the busiest window do not show a limit."""
 ODD_SHARE = 1e-3
-"""Share of dead or hot pixels that is worth mending."""
+"""Share of dead or hot pixels that is a warning."""
 WHITE, BLACK = 0.995, 0.004
+"""Values from which on a pixel counts as white, and up to which as black."""
 CLIPPED, CLIPPED_BADLY, DARK = 0.05, 0.25, 0.5
-"""Shares of pixels that are white or black."""
+"""Shares of white pixels that are a warning and an error; share of black ones for a warning."""
 
 
 def check_layout(capture: Capture, checkup: Checkup) -> bool:
-    """Whether events lie on the pixels of the frames."""
+    """Whether event positions are in the pixel grid of the frames."""
     events, (width, height) = capture.events, capture.camera.size
     if events is None or not len(events):
         if events is not None:
-            checkup.say("error", "no-events", "the stream of events is empty")
+            checkup.add("error", "no-events", "the event stream is empty")
         return False
     reach = float(np.max(events.x)), float(np.max(events.y))
     got = f"x up to {reach[0]:g}, y up to {reach[1]:g}; frames are {width}x{height}"
     swapped = (events.width, events.height) == (height, width) and width != height
     beyond = not events.rectified and (reach[0] >= events.width or reach[1] >= events.height)
     if swapped or (beyond and reach[0] < height and reach[1] < width):
-        checkup.say(
-            "error", "axes-swapped", "x and y of the events are exchanged", got=got,
+        checkup.add(
+            "error", "axes-swapped", "x and y of the events are swapped", got=got,
             do="ingest again with --swap-xy",
         )  # fmt: skip
         return False
     if beyond or (events.width, events.height) != (width, height):
-        checkup.say(
+        checkup.add(
             "error",
             "sizes",
-            "events and frames are not of the same pixels",
-            got=f"{got}; the event sensor says {events.width}x{events.height}",
+            "events and frames have different resolutions",
+            got=f"{got}; the event sensor is {events.width}x{events.height}",
             do="ingest with the calibration of both cameras, so that one is warped to the other",
         )
         return False
@@ -96,38 +96,39 @@ def check_layout(capture: Capture, checkup: Checkup) -> bool:
 
 
 def check_rate(capture: Capture, checkup: Checkup) -> None:
-    """How fast events came, and whether the sensor kept up."""
+    """Event rate, and whether the readout of the sensor was saturated."""
     events = capture.needed_events
     seconds = max(int(events.t_us[-1] - events.t_us[0]), 1) / 1e6
-    window = _windows(events)
+    counts = _events_per_window(events)
     brighter = float(np.mean(np.asarray(events.p) > 0))
-    checkup.say(
+    checkup.add(
         "note",
         "event-rate",
         f"{len(events):,} events in {seconds:.3g} s: {len(events) / seconds / 1e6:.3g} M/s on"
-        f" average, {window.max() / WINDOW_US:.3g} M/s at most, {brighter:.0%} to brighter",
+        f" average, {counts.max() / WINDOW_US:.3g} M/s at most, {brighter:.0%} to brighter",
     )
     if not 0.1 < brighter < 0.9:
-        checkup.say(
+        checkup.add(
             "error",
             "one-sign",
-            "nearly all events have one sign",
+            "nearly all events have the same polarity",
             got=f"{brighter:.1%} to brighter",
             do="check how polarity is stored: 0 and 1, or -1 and +1",
         )
-    busy = window[window > 0]
-    most = float(np.percentile(busy, USUAL_MOST)) if len(busy) else 0.0
-    piled = float((busy >= TOP * most).mean())
-    below = float(((busy >= BELOW * most) & (busy < TOP * most)).mean())
-    if most >= LEAST_WINDOW and (piled > CROWDED or piled > max(PILED, STEEP * below)):
-        checkup.say(
+    active = counts[counts > 0]
+    limit = float(np.percentile(active, LIMIT_PERCENTILE)) if len(active) else 0.0
+    share = float((active >= AT_LIMIT * limit).mean())
+    below = float(((active >= BELOW_LIMIT * limit) & (active < AT_LIMIT * limit)).mean())
+    saturated = share > SATURATED_SHARE or share > max(MIN_SHARE, MIN_RATIO * below)
+    if limit >= MIN_EVENTS and saturated:
+        checkup.add(
             "error",
             "events-saturated",
-            "the event sensor was at the limit of its readout, and lost events",
-            got=f"{piled:.0%} of the milliseconds have {TOP * most:.0f} events or a few more,"
-            f" {below:.0%} a little fewer",
-            do="raise the thresholds, move slower, or read out a part of the sensor; such a"
-            " recording cannot say how bright things were",
+            "the readout of the event sensor was saturated, and events were lost",
+            got=f"{share:.0%} of the milliseconds have at least {AT_LIMIT * limit:.0f} events,"
+            f" {below:.0%} slightly fewer",
+            do="raise the thresholds, move slower, or read out a part of the sensor; brightness"
+            " cannot be reconstructed from such a recording",
         )
 
 
@@ -136,51 +137,51 @@ def check_pixels(capture: Capture, checkup: Checkup) -> None:
     count = counts(capture.needed_events)
     dead, hot = odd_pixels(count)
     for name, odd, do in (
-        ("dead-pixels", dead, "they say nothing; `sharpfield calibrate` maps them"),
+        ("dead-pixels", dead, "they report no events; `sharpfield calibrate` maps them"),
         ("hot-pixels", hot, "ingest with the hot-pixel filter, or mask them"),
     ):
         share = float(odd.mean())
         severity = "warning" if share > ODD_SHARE else "note"
-        places = ", ".join(f"({x}, {y})" for y, x in np.argwhere(odd)[:6])
-        checkup.say(
+        positions = ", ".join(f"({x}, {y})" for y, x in np.argwhere(odd)[:6])
+        checkup.add(
             severity,
             name,
             f"{odd.sum()} {name.replace('-', ' ')} of {odd.size:,}",
-            got=f"at {places}{', ...' if odd.sum() > 6 else ''}" if odd.any() else "",
+            got=f"at {positions}{', ...' if odd.sum() > 6 else ''}" if odd.any() else "",
             do=do if odd.any() else "",
         )
     level = np.log1p(count) / max(np.log1p(np.percentile(count, 99.5)), 1e-9)
     shown = np.repeat((255 * np.clip(level, 0, 1)).astype(np.uint8)[..., None], 3, -1)
     shown[dead], shown[hot] = (38, 86, 190), (245, 160, 40)
-    checkup.images["events of each pixel (log): dead ones blue, hot ones amber"] = shown
+    checkup.images["events of each pixel (log scale): dead pixels blue, hot ones amber"] = shown
 
 
 def check_light(capture: Capture, checkup: Checkup) -> None:
-    """Whether frames are too bright or too dark to be inverted."""
+    """Whether frames are over- or underexposed."""
     frames = capture.needed_frames
     white = np.mean(frames.images >= WHITE * frames.white)
     black = np.mean(frames.images <= BLACK * frames.white)
-    # Rendered objects are laid on white.
+    # Rendered objects are composited on white.
     if white > CLIPPED and capture.known.background != "white":
-        checkup.say(
+        checkup.add(
             "error" if white > CLIPPED_BADLY else "warning",
             "frames-saturated",
-            "much of the frames is white: what was there is lost",
+            "large parts of the frames are overexposed",
             got=f"{white:.0%} of all values",
-            do="shorten the exposure or close the aperture; mask what is white",
+            do="shorten the exposure or close the aperture; mask white areas",
         )
     if black > DARK:
-        checkup.say(
+        checkup.add(
             "warning",
             "frames-dark",
-            "most of the frames is black",
+            "most of the frames is underexposed",
             got=f"{black:.0%} of all values",
             do="lengthen the exposure, or light the scene",
         )
 
 
-def _windows(events: EventStream) -> Int64[np.ndarray, "k"]:
-    """Events in each whole millisecond."""
+def _events_per_window(events: EventStream) -> Int64[np.ndarray, "k"]:
+    """Number of events in each whole millisecond."""
     edges = np.arange(int(events.t_us[0]), int(events.t_us[-1]) + 1, WINDOW_US)
     if len(edges) < 2:
         return np.array([len(events)], np.int64)

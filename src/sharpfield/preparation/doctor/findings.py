@@ -1,4 +1,4 @@
-"""What a checkup says: findings, each with what to do, and what they rest on."""
+"""The result of a checkup: findings, each with what to do, and their evidence."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -12,56 +12,57 @@ ORDER: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     severity: Severity
-    """`error`: training would be misled. `warning`: worth mending. `note`: for the record."""
+    """`error`: training would fail or give wrong results. `warning`: worth fixing. `note`: for the
+    record."""
     check: str
-    """Its name, e.g. `polarity-flipped`."""
+    """Name of the finding, such as `polarity-flipped`."""
     what: str
-    """One sentence."""
+    """The finding in one sentence."""
     got: str = ""
-    """What was measured."""
+    """Measured values."""
     do: str = ""
-    """What to do about it."""
+    """How to fix it."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A number over something that was tried."""
+    """A measured value over a parameter."""
 
     title: str
-    across: str
+    x_label: str
     x: Float64[np.ndarray, "k"]
     y: Float64[np.ndarray, "k"]
 
 
 @dataclass
 class Checkup:
-    """All that was found, in the order it was looked at."""
+    """All findings of a capture, in the order of the checks."""
 
     name: str
     findings: list[Finding] = field(default_factory=list[Finding])
     images: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
-    """By caption."""
+    """Images by caption."""
     curves: list[Curve] = field(default_factory=list[Curve])
 
-    def say(
+    def add(
         self, severity: Severity, check: str, what: str, *, got: str = "", do: str = ""
     ) -> None:
         """Add a finding."""
         self.findings.append(Finding(severity, check, what, got, do))
 
     def has(self, severity: Severity) -> bool:
-        """Whether there is a finding of a severity."""
+        """Whether there is a finding of this severity."""
         return any(one.severity == severity for one in self.findings)
 
     @property
     def sorted(self) -> list[Finding]:
-        """Findings, the worst first."""
+        """Findings, the most severe first."""
         return sorted(self.findings, key=lambda one: ORDER.index(one.severity))
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many there are of each severity."""
+        """Number of findings of each severity."""
         return {kind: sum(one.severity == kind for one in self.findings) for kind in ORDER}

@@ -73,7 +73,7 @@ def _plot(curve: Curve) -> dict[str, Any]:
         "labels": [
             (MARGIN, HEIGHT - MARGIN + 16, "middle", f"{left:.4g}"),
             (WIDTH - MARGIN, HEIGHT - MARGIN + 16, "middle", f"{right:.4g}"),
-            (WIDTH / 2, HEIGHT - 8, "middle", curve.across),
+            (WIDTH / 2, HEIGHT - 8, "middle", curve.x_label),
             (MARGIN - 6, HEIGHT - MARGIN, "end", f"{low:.2g}"),
             (MARGIN - 6, MARGIN + 4, "end", f"{high:.2g}"),
         ],

@@ -1,8 +1,8 @@
-"""Do the poses fit the images, and the motion they tell of the events?
+"""Checks of the poses: do they fit the images (epipolar geometry), and the event rate?
 
-Details that two images share must lie on the lines that poses and focal length say, whatever
-their depth. The focal length is tried at other values: if another one fits clearly better, it is
-wrong. And where poses move the image fast, many events must come.
+Features that two images share must lie on the epipolar lines of poses and focal length, whatever
+their depth. Other focal lengths are tried: if one of them fits clearly better, the stated one is
+wrong. And where the poses move the image fast, the event rate must be high.
 """
 
 from dataclasses import replace
@@ -17,43 +17,45 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.geometry.two_views import PairMatches, find_details, match_pairs, sampson_px
 from sharpfield.preparation.doctor.findings import Checkup, Curve
-from sharpfield.preparation.poses.images import Sharp, sharp_images
+from sharpfield.preparation.poses.images import SfmImages, sfm_images
 
 MOST_IMAGES = 8
-LEAST_DETAILS = 60
-"""Matches over all pairs; fewer do not judge."""
+MIN_MATCHES = 60
+"""Fewer matches over all pairs are too few for the check."""
 FACTORS = np.exp(np.linspace(np.log(0.5), np.log(2.0), 33))
-"""Focal lengths tried, relative to the one given."""
-OFF_BY, GAIN = 0.06, 0.75
-"""Another focal length is right if it differs so much and leaves so small a part of the error."""
+"""Focal lengths tried, relative to the stated one."""
+MIN_DIFFERENCE, MAX_ERROR_RATIO = 0.06, 0.75
+"""Another focal length is reported if its log differs by so much and it reduces the error to this
+share."""
 FINE_PX, POOR_PX, WRONG_PX = 0.15, 1.0, 3.0
-"""Median distance from the lines: below the first nothing is wrong, above the last poses are."""
-MOTION_US, LEAST_WINDOWS = 4_000, 25
-"""Windows in which motion and events are compared."""
+"""Median epipolar distance: below the first all is well, above the last the poses are wrong."""
+MOTION_US, MIN_WINDOWS = 4_000, 25
+"""Length and smallest number of the windows in which motion and event rate are compared."""
 UNRELATED = 0.1
-LATE_US, LATE_STEP_US, LATE_GAIN = 40_000, 2_000, 0.15
-"""Other times of the poses that are tried; they count if the correlation gains so much."""
+"""Correlation below which the event rate does not follow the motion."""
+MAX_SHIFT_US, SHIFT_STEP_US, SHIFT_GAIN = 40_000, 2_000, 0.15
+"""Time shifts of the poses that are tried; one is reported if the correlation gains so much."""
 BLUR_SHARE = 0.15
-"""Blur, as a share of the width, beyond which little can be saved."""
+"""Blur, as a share of the image width, that is a warning."""
 
 
 def check_images(capture: Capture, checkup: Checkup) -> None:
-    """Matched details of frames, against poses and focal length."""
+    """Check poses and focal length by matched features of the frames."""
     frames = capture.needed_frames
     chosen = evenly_spread(np.arange(len(frames)), MOST_IMAGES)
-    sharp = sharp_images(capture, "auto")
+    sharp = sfm_images(capture, "auto")
     rows = np.flatnonzero(np.isin(sharp.frame, chosen))
     poses = _poses(capture, sharp)[rows]
     pairs = [(i, j) for i in range(len(rows)) for j in range(i + 1, len(rows))]
     matches = match_pairs(find_details(sharp.images[rows]), pairs)
     count = sum(len(one) for one in matches)
-    if count < LEAST_DETAILS:
-        checkup.say(
+    if count < MIN_MATCHES:
+        checkup.add(
             "warning" if len(rows) > 2 else "note",
             "matches",
-            "too few details are shared between frames to judge the poses",
+            "too few features match between frames to check the poses",
             got=f"{count} in {len(pairs)} pairs of frames",
-            do="expect poses from elsewhere to be hard to check",
+            do="poses from another source will be hard to check, too",
         )
         return
     errors = np.array([_error(matches, _zoomed(capture.camera, f), poses) for f in FACTORS])
@@ -62,20 +64,25 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
     focal = capture.camera.fx_px
     checkup.curves.append(
         Curve(
-            "Distance of details from their lines, px, for other focal lengths",
+            "Epipolar distance of matches, px, for other focal lengths",
             "focal length, px",
             FACTORS * focal,
             errors,
         )
     )
-    checkup.images["details that two frames share: green on the lines that poses say, else red"] = (
-        _lines(sharp.images[rows], max(matches, key=len), capture.camera, poses)
+    checkup.images["matches of two frames: green on their epipolar lines, else red"] = _lines(
+        sharp.images[rows], max(matches, key=len), capture.camera, poses
     )
-    got = f"median {given:.2f} px from the lines, {count} details of {len(matches)} pairs"
-    off = abs(np.log(FACTORS[best])) > OFF_BY
-    if given > FINE_PX and off and errors[best] < GAIN * given and errors[best] < POOR_PX:
+    got = f"median {given:.2f} px from the epipolar lines, {count} matches of {len(matches)} pairs"
+    differs = abs(np.log(FACTORS[best])) > MIN_DIFFERENCE
+    if (
+        given > FINE_PX
+        and differs
+        and errors[best] < MAX_ERROR_RATIO * given
+        and errors[best] < POOR_PX
+    ):
         unknown = capture.known.intrinsics == "unknown"
-        checkup.say(
+        checkup.add(
             "warning" if unknown else "error",
             "focal-length",
             "the focal length does not fit the images and poses",
@@ -85,7 +92,7 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
             " `sharpfield poses --intrinsics find`",
         )
     elif given > WRONG_PX or (given > POOR_PX and capture.camera.width < 600):
-        checkup.say(
+        checkup.add(
             "error",
             "poses-disagree",
             "the poses do not fit the images",
@@ -94,53 +101,53 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
             " find the poses with `sharpfield poses`",
         )
     else:
-        checkup.say("note", "poses-fit", "poses and focal length fit the images", got=got)
+        checkup.add("note", "poses-fit", "poses and focal length fit the images", got=got)
 
 
 def check_motion(capture: Capture, checkup: Checkup) -> None:
-    """Whether events come when the poses say that the image moves."""
+    """Check the event rate against the image motion of the poses."""
     events, known = capture.events, capture.trajectory.known_us(0)
     if events is None or known is None or events.tracks > 1:
         return
     first, last = max(known[0], int(events.t_us[0])), min(known[1], int(events.t_us[-1]))
-    edges = np.arange(first + LATE_US, last - LATE_US, MOTION_US)
-    if len(edges) < LEAST_WINDOWS:
+    edges = np.arange(first + MAX_SHIFT_US, last - MAX_SHIFT_US, MOTION_US)
+    if len(edges) < MIN_WINDOWS:
         return
     rate = np.diff(np.searchsorted(events.t_us, edges)) / MOTION_US
-    lates = np.arange(-LATE_US, LATE_US + 1, LATE_STEP_US)
+    shifts_us = np.arange(-MAX_SHIFT_US, MAX_SHIFT_US + 1, SHIFT_STEP_US)
     found = np.array(
-        [float(np.corrcoef(rate, image_speed(capture, edges + late))[0, 1]) for late in lates]
+        [float(np.corrcoef(rate, image_speed(capture, edges + shift))[0, 1]) for shift in shifts_us]
     )
     if not np.isfinite(found).all():
         return
-    now, best = found[len(lates) // 2], int(found.argmax())
+    now, best = found[len(shifts_us) // 2], int(found.argmax())
     checkup.curves.append(
         Curve(
-            "Correlation of the event rate with the motion that poses say",
+            "Correlation of the event rate with the image motion of the poses",
             "shift of the poses, ms",
-            -lates / 1000.0,
+            -shifts_us / 1000.0,
             found,
         )
     )
     got = f"correlation {now:.2f} over {len(rate)} windows of {MOTION_US // 1000} ms"
-    if abs(lates[best]) > MOTION_US and found[best] > now + LATE_GAIN and found[best] > 0.5:
-        checkup.say(
+    if abs(shifts_us[best]) > MOTION_US and found[best] > now + SHIFT_GAIN and found[best] > 0.5:
+        checkup.add(
             "warning",
             "pose-time-shift",
-            "the events would fit the motion better at another time of the poses",
-            got=f"{got}; {found[best]:.2f} with poses {-lates[best] / 1000:+.0f} ms",
+            "the event rate fits the motion better with the poses shifted in time",
+            got=f"{got}; {found[best]:.2f} with a shift of {-shifts_us[best] / 1000:+.0f} ms",
             do="check the clock of the poses: `sharpfield poses --trajectory FILE --offset-ms ...`",
         )
     elif now < UNRELATED:
-        checkup.say(
+        checkup.add(
             "note", "motion", "the event rate does not follow the motion of the poses", got=got
         )
     else:
-        checkup.say("note", "motion", "the event rate follows the motion of the poses", got=got)
+        checkup.add("note", "motion", "the event rate follows the motion of the poses", got=got)
 
 
 def check_blur(capture: Capture, checkup: Checkup) -> None:
-    """How far the image moves during each exposure."""
+    """Check the blur of each frame: how far the image moves during its exposure."""
     exposure = capture.needed_frames.exposure
     blurred = np.flatnonzero(~exposure.instant)
     if not len(blurred) or capture.trajectory.known_us(0) is None:
@@ -150,7 +157,7 @@ def check_blur(capture: Capture, checkup: Checkup) -> None:
     worst = int(length.argmax())
     got = f"most in {names[blurred[worst]]}: {length[worst]:.1f} px"
     much = np.median(length) > BLUR_SHARE * capture.camera.width
-    checkup.say(
+    checkup.add(
         "warning" if much else "note",
         "blur",
         f"the median frame is blurred over {np.median(length):.1f} px",
@@ -180,13 +187,13 @@ def image_speed(capture: Capture, edges_us: Int64[np.ndarray, "k"]) -> Float64[n
 
 
 def _blur_px(capture: Capture, frame: int) -> float:
-    """Length of the path of the image during an exposure."""
+    """Length of the image motion during an exposure, in px."""
     opens, closes = capture.needed_frames.exposure.window(frame)
     edges = np.linspace(opens, closes, 9).round().astype(np.int64)
     return float(image_speed(capture, edges).sum())
 
 
-def _poses(capture: Capture, sharp: Sharp) -> Float64[np.ndarray, "n 3 4"]:
+def _poses(capture: Capture, sharp: SfmImages) -> Float64[np.ndarray, "n 3 4"]:
     time = torch.from_numpy(capture.clock.unit(sharp.time_us))
     track = torch.from_numpy(capture.needed_frames.track[sharp.frame])
     return capture.trajectory.pose(time, track).detach().double().numpy()
@@ -208,15 +215,15 @@ def _lines(
     camera: Camera,
     poses: Float64[np.ndarray, "n 3 4"],
 ) -> np.ndarray:
-    """Two images side by side; each detail in the colour of its distance from the line."""
+    """Two images side by side, their matches coloured by epipolar distance."""
     both = [np.broadcast_to(images[i], (*images[i].shape[:2], 3)) for i in matches.pair]
     shown = np.ascontiguousarray(np.concatenate(both, 1))
-    off = sampson_px(matches, camera, poses)
+    distance_px = sampson_px(matches, camera, poses)
     zoom = 2 if shown.shape[1] < 960 else 1
     shown = cv2.resize(shown, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
     width = zoom * camera.width
-    for (one, two), away in list(zip(matches.xy, off, strict=True))[:120]:
-        colour = (40, 200, 90) if away < POOR_PX else (230, 60, 40)
+    for (one, two), distance in list(zip(matches.xy, distance_px, strict=True))[:120]:
+        colour = (40, 200, 90) if distance < POOR_PX else (230, 60, 40)
         a = (round(zoom * one[0]), round(zoom * one[1]))
         b = (round(zoom * two[0]) + width, round(zoom * two[1]))
         cv2.line(shown, a, b, colour, 1, cv2.LINE_AA)

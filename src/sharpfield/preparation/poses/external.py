@@ -1,8 +1,8 @@
-"""Poses from elsewhere, attached to a capture: other programs, motion capture, motor encoders.
+"""Attach external poses to a capture: of other programs, motion capture, motor encoders.
 
-A file tracks a *body* on a clock of its own. The pose of the camera is the body's, followed by
-where the camera sits on it (hand-eye, body-from-camera); a time of the capture is a time of the
-file plus an offset. Frames and events that the path does not cover are left out.
+A pose file tracks a *body* on its own clock. The pose of the camera is that of the body times the
+hand-eye transform (body-from-camera); a time of the capture is a time of the file plus an offset.
+Frames and events that the trajectory does not cover are left out.
 """
 
 from dataclasses import dataclass, replace
@@ -18,14 +18,14 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.geometry.two_views import depths_of, find_details, match_pairs, pairs_apart
-from sharpfield.preparation.poses.find import split_of, within
-from sharpfield.preparation.poses.images import sharp_images
-from sharpfield.preparation.poses.path import Laid, frames_of, path_through
-from sharpfield.preparation.poses.world import Known
+from sharpfield.preparation.poses.find import events_on_path, split_of
+from sharpfield.preparation.poses.images import sfm_images
+from sharpfield.preparation.poses.path import FramesOnPath, frames_of, path_through
+from sharpfield.preparation.poses.world import KnownPoses
 
 PAIRS = 12
 BOUNDS_PERCENT, BOUNDS_MARGIN = (1.0, 99.0), 1.2
-"""Near and far are these percentiles of the depth of matched details, and a margin."""
+"""Near and far are these percentiles of the depth of matched features, with a margin."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class Mount:
     """How a tracked body relates to the camera."""
 
     offset_us: int = 0
-    """Added to times of the file, to have times of the capture."""
+    """Added to times of the file to get times of the capture."""
     body_from_camera: Float64[np.ndarray, "3 4"] | None = None
-    """Where the camera sits; None if the file tracks the camera itself."""
+    """Hand-eye transform; None if the file tracks the camera itself."""
 
 
 @dataclass(frozen=True)
 class Attached:
-    """A capture with poses from elsewhere."""
+    """A capture with external poses."""
 
     capture: Capture
     kept: Int64[np.ndarray, "m"]
-    """Which frames of the original capture are in it."""
+    """Indices of the frames of the original capture that are in it."""
     covered_us: tuple[int, int] | None
-    """What of the capture's time the poses span; None if cameras stand still."""
+    """Time span of the poses; None if the cameras do not move."""
 
 
 def attach(
@@ -55,11 +55,11 @@ def attach(
     """The capture with the poses of a file.
 
     Args:
-        capture: Poses it has are not looked at.
-        path: What the file says.
-        mount: How its clock and its body relate to the capture's.
-        bounds: Near and far; by default those of the capture, or where it does not know them, what
-            matched details of the frames show.
+        capture: Poses it has are not used.
+        path: Poses of the file.
+        mount: Time offset and hand-eye transform.
+        bounds: Near and far; by default those of the capture, or where these are unknown, from
+            matched features of the frames.
 
     Raises:
         CaptureError: Times or names do not fit, or bounds are unknown and cannot be found.
@@ -71,7 +71,9 @@ def attach(
         middle = capture.needed_frames.exposure.middle_us[frame]
         laid = path_through(capture.needed_frames, frame, middle, poses, capture.clock)
     streams = {
-        name: None if (held := getattr(capture, name)) is None else within(held, laid.path, laid)
+        name: None
+        if (held := getattr(capture, name)) is None
+        else events_on_path(held, laid.path, laid)
         for name in ("events", "test_events")
     }
     made = replace(
@@ -94,8 +96,8 @@ def attach(
     return Attached(made, laid.kept, laid.path.known_us(0))
 
 
-def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> Known:
-    """Poses of the camera at some times of the capture; NaN where the file does not reach.
+def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> KnownPoses:
+    """Poses of the camera at some times of the capture; NaN outside the time of the file.
 
     Raises:
         CaptureError: The file has no times.
@@ -108,7 +110,7 @@ def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"])
     unit = torch.from_numpy(clock.unit(times_us))
     found = along.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).numpy()
     outside = (times_us < stamps[0]) | (times_us > stamps[-1])
-    return Known(np.where(outside[:, None, None], np.nan, found))
+    return KnownPoses(np.where(outside[:, None, None], np.nan, found))
 
 
 def _mounted(poses: Float64[np.ndarray, "p 3 4"], mount: Mount) -> Float64[np.ndarray, "p 3 4"]:
@@ -120,7 +122,7 @@ def _mounted(poses: Float64[np.ndarray, "p 3 4"], mount: Mount) -> Float64[np.nd
 
 def _timed(
     capture: Capture, path: ExternalPath, poses: Float64[np.ndarray, "p 3 4"], mount: Mount
-) -> Laid:
+) -> FramesOnPath:
     """Everything that the path covers; there must be one camera."""
     assert path.times_us is not None, "the caller looked"
     stamps = path.times_us + mount.offset_us
@@ -134,7 +136,7 @@ def _timed(
             if capture.events is None
             else int(np.diff(np.searchsorted(capture.events.t_us, (stamps[0], stamps[-1])))[0]),
         )
-        return Laid(None, laid_path, np.zeros(0, np.int64), np.zeros(1, np.int64))
+        return FramesOnPath(None, laid_path, np.zeros(0, np.int64), np.zeros(1, np.int64))
     if len(np.unique(frames.track)) > 1:
         raise CaptureError(
             "a file of one path cannot place several cameras",
@@ -146,7 +148,9 @@ def _timed(
     _expect_some(capture, stamps, int(inside.sum()))
     kept = np.flatnonzero(inside)
     track_of = np.zeros(int(frames.track.max()) + 1, np.int64)
-    return Laid(frames_of(frames, kept, np.zeros(len(kept), np.int64)), laid_path, kept, track_of)
+    return FramesOnPath(
+        frames_of(frames, kept, np.zeros(len(kept), np.int64)), laid_path, kept, track_of
+    )
 
 
 def _expect_some(capture: Capture, stamps: Int64[np.ndarray, "p"], covered: int) -> None:
@@ -223,7 +227,7 @@ def _seen_bounds(capture: Capture) -> tuple[float, float]:
     )
     if capture.frames is None:
         raise unknown
-    sharp = sharp_images(capture, "auto")
+    sharp = sfm_images(capture, "auto")
     time = torch.from_numpy(capture.clock.unit(sharp.time_us))
     track = torch.from_numpy(capture.frames.track[sharp.frame])
     poses = capture.trajectory.pose(time, track).detach().double().numpy()

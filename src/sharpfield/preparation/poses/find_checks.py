@@ -1,9 +1,9 @@
-"""Whether images show enough depth to tell where they were taken from.
+"""Check that the scene has enough depth variation for its poses to be well determined.
 
-Before a plane, moving sideways and turning look nearly alike, and so do a long lens from afar and a
-short one from nearby. A map of such a scene fits its images well, and is still wrong. *Relief* is
-what tells them apart: how much of what two images far apart both show departs from the plane that
-explains most of it, by more than images are exact.
+In front of a plane, translation and rotation look nearly alike, and so do a long focal length from
+afar and a short one from nearby: a reconstruction of such a scene fits its images well and is still
+wrong. *Relief* measures the depth variation: the share of the points that two distant images share
+which depart from the best plane (homography) by more than the measurement error.
 
 Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 11.9 and 13.
 """
@@ -19,36 +19,36 @@ from sharpfield.preparation.poses.mapping import Intrinsics, Map
 
 PAIRS = 12
 FAR = 0.75
-"""Of pairs that share points, those are looked at that are farther apart than this share of all."""
+"""Quantile of the distances of image pairs that share points; only pairs farther apart are used."""
 SHARED, VIEWS = 20, 3
-"""Two images must share so many points, each seen in so many images."""
+"""Two images must share so many points, each observed in so many images."""
 TOLERANCE, LEAST_PX = 3.0, 1.0
-"""A point departs from a plane from so many times the map's error on, and from so many px."""
+"""A point is off a plane if its error is so many times that of the map, and so many px."""
 LEAST_OFF = 0.1
-"""Share of points that must depart from the plane for depth to be told from them."""
+"""Share of points off the plane below which the scene counts as flat."""
 
 
 @dataclass(frozen=True)
 class Relief:
-    """How far the map is from a plane."""
+    """How much the points depart from a plane."""
 
     off_plane: float
-    """Share of what two images show that a plane does not explain; the median over pairs."""
+    """Share of the shared points that are off the best plane; median over image pairs."""
     tolerance_px: float
-    """To within how many px it has to explain it."""
+    """Largest error of a point on the plane."""
     thickness: float
-    """Median distance of points from the plane that fits them best, over their median depth."""
+    """Median distance of the points from the best plane, over their median depth."""
     pairs: int
-    """Of images far apart that were looked at."""
+    """Number of image pairs."""
 
     @property
     def flat(self) -> bool:
-        """Whether a plane explains about as much as the map does."""
+        """Whether a plane explains nearly all points."""
         return self.off_plane < LEAST_OFF
 
 
 def relief(found: Map) -> Relief | None:
-    """How much depth a map shows; None if too few points are shared to say."""
+    """Depth variation of a map; None if too few points are shared to measure it."""
     pairs = _pairs_far_apart(found)
     if not pairs:
         return None
@@ -59,25 +59,25 @@ def relief(found: Map) -> Relief | None:
 
 
 def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | None:
-    """What to know of poses found before something flat, and what to try; None if all is well."""
+    """Warning about poses of a flat scene, and what to try; None if the scene is not flat."""
     if shown is None or not shown.flat:
         return None
     lens = intrinsics != "given"
     said = (
-        f"the scene is nearly flat: in images far apart a plane explains"
+        f"the scene is nearly flat: in distant images a plane explains"
         f" {100 * (1 - shown.off_plane):.0f} % of the points to {shown.tolerance_px:.1f} px, and"
-        f" half of them lie within {100 * shown.thickness:.1f} % of their depth from one plane;"
-        f" camera places{' and the focal length' if lens else ''} may be off by a tenth"
+        f" half of them are within {100 * shown.thickness:.1f} % of their depth from one plane;"
+        f" camera positions{' and the focal length' if lens else ''} may be off by a tenth"
     )
     known = "give the focal length (ingest with --calibration, then --intrinsics given); "
     return said, (
-        f"{known if lens else ''}let training mend poses (train ev-splat --preset refine); record"
-        " with something at another depth in view, and move farther sideways"
+        f"{known if lens else ''}refine poses in training (train ev-splat --preset refine); record"
+        " objects at other depths, and move farther sideways"
     )
 
 
 def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
-    """Pairs of images that share points and are far from each other, and those points."""
+    """Pairs of distant images that share points, and the indices of these points."""
     view, point = found.observations.T
     good = found.track_length[point] >= VIEWS
     shape = len(found.poses), len(found.points)
@@ -97,7 +97,7 @@ def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]
 def _off_plane(
     found: Map, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
 ) -> float:
-    """Share of points whose places in two images the best homography does not relate."""
+    """Share of points whose positions in two images the best homography does not relate."""
     first, second = (_ideal_px(found, i, rows) for i in (one, two))
     cv2.setRNGSeed(0)
     _, explained = cv2.findHomography(first, second, cv2.RANSAC, tolerance_px)
@@ -105,18 +105,18 @@ def _off_plane(
 
 
 def _ideal_px(found: Map, view: int, rows: Int64[np.ndarray, "m"]) -> Float64[np.ndarray, "m 2"]:
-    """Where a image of an ideal lens shows points of the map."""
+    """Projections of points by a pinhole camera without distortion."""
     pose = found.poses[view]
     local = (found.points[rows] - pose[:, 3]) @ pose[:, :3]
     return found.camera.fx_px * local[:, :2] / local[:, 2:]
 
 
 def _thickness(found: Map) -> float:
-    """Median distance from the plane that half of the points lie closest to, over median depth."""
+    """Median distance from the plane fitted to the closest half of the points, over their depth."""
     good = found.points[found.track_length >= VIEWS]
     kept = np.ones(len(good), bool)
     distance = np.zeros(len(good))
-    for _ in range(5):  # trimmed: a few things before a wall do not tilt it
+    for _ in range(5):  # trimmed: a few objects in front of a wall do not tilt it
         centre = good[kept].mean(0)
         normal = np.linalg.svd(good[kept] - centre, full_matrices=False)[2][2]
         distance = np.abs((good - centre) @ normal)

@@ -1,9 +1,9 @@
-"""Structure from motion: where images were taken from, found from the images alone.
+"""Structure from motion with COLMAP (the package `pycolmap`, extra `sfm`).
 
-COLMAP does the work (the package `pycolmap`, extra `sfm`): features, matches that fit the geometry
-of two views, then a *map* of points that grows image by image. It is told of small and noisy
-images: fainter features and fewer agreeing points suffice than by default. Where images are
-left out, it is tried again with fainter features still, and the better map is kept.
+Features are matched and verified by two-view geometry, then a *map* of points grows image by image.
+For small and noisy images, the contrast threshold of features and the number of inliers are lower
+than COLMAP's defaults. If images are not registered, it is run again with an even lower contrast
+threshold, and the better map is kept.
 
 Source: Schönberger and Frahm, "Structure-from-motion revisited" (CVPR 2016).
 """
@@ -31,67 +31,69 @@ FOUND_MODELS = {
     "radial": "SIMPLE_RADIAL",
     **{name: LENSES[name].colmap[0].name for name in ("brown", "fisheye")},
 }
-"""COLMAP's models of the lenses that can be found."""
+"""COLMAP's camera model of each lens that can be estimated."""
 
-LEAST_FEATURES = 80
-"""Fewer in a image are why it fails."""
-LEAST_MATCHES = 15
-"""Matches that agree on the geometry of two views, to count as seeing the same."""
-LEAST_POINTS = 12
-"""Points of the map that must agree on a image's pose."""
-LEAST_IMAGES = 3
-"""Of a map."""
+MIN_FEATURES = 80
+"""With fewer features an image is reported as lacking texture."""
+MIN_INLIERS = 15
+"""Smallest number of matches that fit the two-view geometry of a pair."""
+MIN_POSE_INLIERS = 12
+"""Smallest number of points that fit the pose of an image."""
+MIN_IMAGES = 3
+"""Smallest number of images of a map."""
 EXHAUSTIVE = 160
-"""Up to so many images all pairs are compared; of more, each with its neighbours in time."""
+"""Up to so many images all pairs are matched; beyond, each image with its neighbours in time."""
 NEIGHBOURS = 20
+"""Neighbours in time that each image is then matched with."""
 
-QUIET = 3
-"""COLMAP's level of messages: only those it dies of."""
+FATAL = 3
+"""COLMAP's log level of fatal errors only."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How hard to look."""
+    """Sensitivity of one attempt."""
 
-    faintest: float
-    """Contrast of a feature, 0...1."""
+    peak_threshold: float
+    """Smallest contrast of a SIFT feature, 0...1."""
     guided: bool = False
-    """Match again along the lines that the geometry of two views allows."""
-    first_pair: int = 100
-    """Agreeing matches of the two images the map begins with."""
+    """Match again along epipolar lines (guided matching)."""
+    initial_inliers: int = 100
+    """Inliers of the image pair that the map starts from."""
 
 
-EFFORTS = (Effort(0.0067), Effort(0.002, guided=True, first_pair=40))
-"""Tried in turn while images are left out."""
+EFFORTS = (Effort(0.0067), Effort(0.002, guided=True, initial_inliers=40))
+"""Tried in turn while images are not registered."""
 
 
 @dataclass(frozen=True)
 class LensTask:
-    """What is known of the lens, and what is to be found."""
+    """Known and unknown parameters of the camera."""
 
     camera: Camera
     intrinsics: Intrinsics = "given"
-    """`given` keeps the camera, `refine` starts from its focal length, `find` knows nothing."""
+    """`given` keeps the camera, `refine` starts from its focal length, `find` estimates all."""
     lens: Lens = "pinhole"
-    """What to find; only for `find`."""
+    """Lens model to estimate; only for `find`."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What COLMAP saw in each image."""
+class MatchCounts:
+    """Features and matches of each image."""
 
     features: Int64[np.ndarray, "n"]
+    """Number of features."""
     matches: Int64[np.ndarray, "n"]
-    """That agree with the image it has most in common with."""
+    """Inliers with the image it shares most with."""
     partners: Int64[np.ndarray, "n"]
-    """Images it has something in common with."""
-    flat_pairs: float
-    """Share of pairs in which a plane, or turning on the spot, explains all matches."""
+    """Number of images it has enough inliers with."""
+    planar_pairs: float
+    """Share of pairs whose matches are explained by a plane or a pure rotation."""
 
 
 @dataclass(frozen=True)
 class Map:
-    """Poses and points, in a world of no particular scale."""
+    """Poses and points of structure from motion, in a world of arbitrary scale."""
 
     registered: Bool[np.ndarray, "n"]
     poses: Float64[np.ndarray, "n 3 4"]
@@ -100,40 +102,40 @@ class Map:
     points: Float64[np.ndarray, "m 3"]
     point_error_px: Float64[np.ndarray, "m"]
     observations: Int64[np.ndarray, "o 2"]
-    """Which image shows which point."""
+    """Pairs of image index and point index."""
     error_px: Float64[np.ndarray, "n"]
     """Mean reprojection error of each image; NaN where not registered."""
 
     @property
     def track_length(self) -> Int64[np.ndarray, "m"]:
-        """How many images show each point."""
+        """Number of images that observe each point."""
         return np.bincount(self.observations[:, 1], minlength=len(self.points))
 
 
 def map_images(
     images: UInt8[np.ndarray, "n h w c"], task: LensTask, *, seed: int = 0
-) -> tuple[Map | None, Seen]:
-    """Find where images of one camera were taken from.
+) -> tuple[Map | None, MatchCounts]:
+    """Find the poses of images of one camera.
 
     Args:
-        images: Display-referred, in the order of time.
-        task: About the lens.
-        seed: Of what is drawn by chance.
+        images: Display domain, in the order of time.
+        task: Known and unknown parameters of the camera.
+        seed: Random seed of RANSAC.
 
     Returns:
-        The map, or None if none could be begun; and what was seen in any case.
+        The map, or None if it could not be initialised; and counts of features and matches.
 
     Raises:
         MissingExtra: pycolmap is not installed.
         CaptureError: There are too few images.
     """
     colmap = need("pycolmap", extra="sfm", purpose="finding poses")
-    if len(images) < LEAST_IMAGES:
+    if len(images) < MIN_IMAGES:
         raise CaptureError(
             "too few images to find poses from",
-            got=f"{len(images)}, at least {LEAST_IMAGES} are needed",
+            got=f"{len(images)}, at least {MIN_IMAGES} are needed",
         )
-    best: tuple[Map | None, Seen] | None = None
+    best: tuple[Map | None, MatchCounts] | None = None
     with tempfile.TemporaryDirectory(prefix="sharpfield-poses-") as folder, _quiet(colmap):
         names = [f"{i:06d}.png" for i in range(len(images))]
         (Path(folder) / "images").mkdir()
@@ -157,7 +159,7 @@ def _count(made: Map | None) -> int:
 @contextmanager
 def _quiet(colmap: ModuleType) -> Generator[None, None, None]:
     before = colmap.logging.minloglevel
-    colmap.logging.minloglevel = QUIET
+    colmap.logging.minloglevel = FATAL
     try:
         yield
     finally:
@@ -174,21 +176,21 @@ class _Work:
     task: LensTask
     seed: int
 
-    def run(self, effort: Effort, place: Path) -> tuple[Map | None, Seen]:
-        place.mkdir()
+    def run(self, effort: Effort, folder: Path) -> tuple[Map | None, MatchCounts]:
+        folder.mkdir()
         self.colmap.set_random_seed(self.seed)
-        database = place / "database.db"
+        database = folder / "database.db"
         self._extract(database, effort)
         self._match(database, effort)
-        seen = self._seen(database)
-        return self._grow(database, place, effort), seen
+        seen = self._match_counts(database)
+        return self._map(database, folder, effort), seen
 
     def _extract(self, database: Path, effort: Effort) -> None:
         reader = self.colmap.ImageReaderOptions()
         reader.camera_model, parameters = _parameters(self.task)
         reader.camera_params = ",".join(f"{value:.12g}" for value in parameters)
         options = self.colmap.FeatureExtractionOptions()
-        options.sift.peak_threshold = effort.faintest
+        options.sift.peak_threshold = effort.peak_threshold
         self.colmap.extract_features(
             database,
             self.folder / "images",
@@ -203,7 +205,7 @@ class _Work:
         matching = self.colmap.FeatureMatchingOptions()
         matching.guided_matching = effort.guided
         check = self.colmap.TwoViewGeometryOptions()
-        check.min_num_inliers = LEAST_MATCHES
+        check.min_num_inliers = MIN_INLIERS
         check.ransac.random_seed = self.seed
         common: dict[str, Any] = {"matching_options": matching, "verification_options": check}
         if len(self.names) <= EXHAUSTIVE:
@@ -215,10 +217,10 @@ class _Work:
             database, **common, pairing_options=near, device=self.colmap.Device.cpu
         )
 
-    def _seen(self, database: Path) -> Seen:
+    def _match_counts(self, database: Path) -> MatchCounts:
         count = len(self.names)
         features, matches = np.zeros(count, np.int64), np.zeros(count, np.int64)
-        partners, flat, pairs_seen = np.zeros(count, np.int64), 0, 0
+        partners, planar_count, pairs_seen = np.zeros(count, np.int64), 0, 0
         kinds = self.colmap.TwoViewGeometryConfiguration
         planar = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
         with self.colmap.Database.open(database) as held:
@@ -227,35 +229,35 @@ class _Work:
                 features[i] = held.num_keypoints_for_image(number)
             for pair, view in zip(*held.read_two_view_geometries(), strict=True):
                 agree = len(view.inlier_matches)
-                if agree < LEAST_MATCHES:
+                if agree < MIN_INLIERS:
                     continue
                 both = [row[number] for number in self.colmap.pair_id_to_image_pair(pair)]
                 matches[both] = np.maximum(matches[both], agree)
                 partners[both] += 1
-                pairs_seen, flat = pairs_seen + 1, flat + (view.config in planar)
-        return Seen(features, matches, partners, flat / max(pairs_seen, 1))
+                pairs_seen, planar_count = pairs_seen + 1, planar_count + (view.config in planar)
+        return MatchCounts(features, matches, partners, planar_count / max(pairs_seen, 1))
 
-    def _grow(self, database: Path, place: Path, effort: Effort) -> Map | None:
+    def _map(self, database: Path, folder: Path, effort: Effort) -> Map | None:
         options = self.colmap.IncrementalPipelineOptions()
-        options.multiple_models, options.min_model_size = False, LEAST_IMAGES
+        options.multiple_models, options.min_model_size = False, MIN_IMAGES
         options.extract_colors, options.random_seed = False, self.seed
         found = self.task.intrinsics != "given"
         options.ba_refine_focal_length = options.ba_refine_extra_params = found
         options.mapper.abs_pose_refine_focal_length = found
         options.mapper.abs_pose_refine_extra_params = found
-        options.mapper.abs_pose_min_num_inliers = LEAST_POINTS
-        options.mapper.init_min_num_inliers = effort.first_pair
+        options.mapper.abs_pose_min_num_inliers = MIN_POSE_INLIERS
+        options.mapper.init_min_num_inliers = effort.initial_inliers
         made = self.colmap.incremental_mapping(
-            database, self.folder / "images", place, options=options
+            database, self.folder / "images", folder, options=options
         )
         if not made:
             return None
         largest = max(made.values(), key=lambda one: one.num_reg_images())
-        return _map(largest, len(self.names), self.task)
+        return _as_map(largest, len(self.names), self.task)
 
 
 def _parameters(task: LensTask) -> tuple[str, list[float]]:
-    """COLMAP's camera model, and its parameters as far as they are known."""
+    """COLMAP's camera model, and its known parameters."""
     camera = task.camera
     if task.intrinsics == "find":
         return FOUND_MODELS[task.lens], []
@@ -272,8 +274,8 @@ def _parameters(task: LensTask) -> tuple[str, list[float]]:
     raise CaptureError("COLMAP has no camera model for the lens", got=camera.lens)
 
 
-def _map(made: Any, count: int, task: LensTask) -> Map:
-    """Our arrays of COLMAP's reconstruction."""
+def _as_map(made: Any, count: int, task: LensTask) -> Map:
+    """The arrays of a reconstruction of COLMAP."""
     registered, error = np.zeros(count, bool), np.full(count, np.nan)
     poses, observations = np.zeros((count, 3, 4)), []
     row_of = {number: row for row, number in enumerate(sorted(made.points3D))}
@@ -287,12 +289,12 @@ def _map(made: Any, count: int, task: LensTask) -> Map:
         poses[i] = camera_from_world.inverse().matrix()
         points = [point for point in image.points2D if point.has_point3D()]
         observations += [(i, row_of[point.point3D_id]) for point in points]
-        away = [
-            np.linalg.norm(np.asarray(place) - point.xy)
+        distances_px = [
+            np.linalg.norm(np.asarray(projected) - point.xy)
             for point in points
-            if (place := image.project_point(made.points3D[point.point3D_id].xyz)) is not None
+            if (projected := image.project_point(made.points3D[point.point3D_id].xyz)) is not None
         ]
-        error[i] = float(np.mean(away)) if away else np.nan
+        error[i] = float(np.mean(distances_px)) if distances_px else np.nan
     inside = [made.points3D[number] for number in row_of]
     camera = task.camera
     if task.intrinsics != "given":

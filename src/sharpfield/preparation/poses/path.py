@@ -1,8 +1,8 @@
-"""From poses of images to where the camera is at any time.
+"""From poses of images to a trajectory over time.
 
-Frames of a camera that moved lie on one path: a cubic through the poses found, SLERP for its
-rotation. It begins where the first shutter opened and ends where the last one closed; these two
-poses are carried on at the speed of the nearest part. Photos, each with a track of its own, stand.
+The trajectory of a moving camera is a cubic spline through the poses found, with SLERP for the
+rotation. It is extrapolated to the opening of the first shutter and the closing of the last one, at
+the speed of the nearest segment. Photos, each on a track of its own, have a constant pose.
 """
 
 from dataclasses import dataclass, replace
@@ -16,30 +16,30 @@ from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Still, Tracks
 
-FARTHEST = 1.0
-"""A path is carried on by at most so many times the gap between its last two poses."""
+MAX_EXTRAPOLATION = 1.0
+"""Longest extrapolation, in intervals between the last two poses."""
 
 
 def moving_tracks(frames: Frames) -> Int64[np.ndarray, "k"]:
-    """Tracks with several frames at different times: cameras that may have moved."""
+    """Tracks with several frames: cameras that may have moved."""
     tracks, count = np.unique(frames.track, return_counts=True)
     return tracks[count > 1]
 
 
-def carried_on(
+def extrapolated(
     times_us: Int64[np.ndarray, "p"],
     poses: Float64[np.ndarray, "p 3 4"],
     window_us: tuple[int, int],
 ) -> tuple[Int64[np.ndarray, "q"], Float64[np.ndarray, "q 3 4"]]:
-    """Poses with one more at either end, so that a window is covered as far as can be trusted.
+    """Poses with one more at either end, so that a window is covered as far as allowed.
 
     Args:
         times_us: Ascending, at least two.
         poses: World-from-camera.
-        window_us: What ought to be covered.
+        window_us: Time span to cover.
     """
-    begin = max(window_us[0], int(times_us[0] - FARTHEST * (times_us[1] - times_us[0])))
-    end = min(window_us[1], int(times_us[-1] + FARTHEST * (times_us[-1] - times_us[-2])))
+    begin = max(window_us[0], int(times_us[0] - MAX_EXTRAPOLATION * (times_us[1] - times_us[0])))
+    end = min(window_us[1], int(times_us[-1] + MAX_EXTRAPOLATION * (times_us[-1] - times_us[-2])))
     if begin < times_us[0]:
         first = _beyond(poses[1], poses[0], (times_us[0] - begin) / (times_us[1] - times_us[0]))
         times_us, poses = np.insert(times_us, 0, begin), np.insert(poses, 0, first, axis=0)
@@ -50,16 +50,16 @@ def carried_on(
 
 
 @dataclass(frozen=True)
-class Laid:
-    """A path, and what lies on it."""
+class FramesOnPath:
+    """A trajectory, and the frames on it."""
 
     frames: Frames | None
-    """Those that lie on it; their tracks are numbered anew."""
+    """Frames with a pose; their tracks are renumbered."""
     path: Stamped | Still | Tracks
     kept: Int64[np.ndarray, "m"]
-    """Which frames of the capture they are."""
+    """Their indices in the capture."""
     track_of: Int64[np.ndarray, "k"]
-    """New number of each old track, -1 for those that were lost."""
+    """New number of each old track, -1 for those without poses."""
 
 
 def path_through(
@@ -68,15 +68,15 @@ def path_through(
     time_us: Int64[np.ndarray, "n"],
     poses: Float64[np.ndarray, "n 3 4"],
     clock: Clock,
-) -> Laid:
-    """The path of all cameras.
+) -> FramesOnPath:
+    """The trajectory of all cameras.
 
     Args:
-        frames: Of the capture.
-        frame: Which frame each pose was found for.
-        time_us: The instant of each.
+        frames: Frames of the capture.
+        frame: Index of the frame of each pose.
+        time_us: Instant of each pose.
         poses: World-from-camera.
-        clock: Of the capture.
+        clock: Clock of the capture.
     """
     moving, standing = list[Stamped](), list[int]()
     track_of = np.full(int(frames.track.max()) + 1, -1)
@@ -91,7 +91,7 @@ def path_through(
             continue
         opens, closes = frames.exposure.open_us[member], frames.exposure.close_us[member]
         window = int(opens.min()), int(closes.max())
-        times, through = carried_on(times, poses[own[first]], window)
+        times, through = extrapolated(times, poses[own[first]], window)
         on_path[member] = (opens >= times[0]) & (closes <= times[-1])
         track_of[one] = len(moving)
         moving.append(Stamped(times, through, clock))
@@ -106,24 +106,24 @@ def path_through(
     path = Still(still) if not moving else Tracks(moving, still)
     if len(moving) == 1 and not standing:
         path = moving[0]
-    return Laid(frames_of(frames, kept, track_of[frames.track[kept]]), path, kept, track_of)
+    return FramesOnPath(frames_of(frames, kept, track_of[frames.track[kept]]), path, kept, track_of)
 
 
 def _beyond(
     before: Float64[np.ndarray, "3 4"], last: Float64[np.ndarray, "3 4"], share: float
 ) -> Float64[np.ndarray, "3 4"]:
-    """The last pose, moved on by a share of the motion that led to it."""
+    """The last pose, extrapolated by a share of the motion that led to it."""
     one, two = torch.from_numpy(before), torch.from_numpy(last)
     turn = se3.rotation_log(two[:, :3] @ one[:, :3].mT)
     rotation = se3.rotation_exp(share * turn) @ two[:, :3]
-    place = two[:, 3:] + share * (two[:, 3:] - one[:, 3:])
-    return torch.cat([rotation, place], -1).numpy()
+    position = two[:, 3:] + share * (two[:, 3:] - one[:, 3:])
+    return torch.cat([rotation, position], -1).numpy()
 
 
 def frames_of(
     frames: Frames, chosen: Int64[np.ndarray, "m"], track: Int64[np.ndarray, "m"]
 ) -> Frames:
-    """Some of the frames, on new tracks; depth is left out, being in units of another world."""
+    """Some of the frames, on new tracks; without depth, whose units are those of another world."""
     return replace(
         frames,
         images=frames.images[chosen],

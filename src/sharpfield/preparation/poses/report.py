@@ -1,5 +1,6 @@
 """Reports of pose finding: `poses.json`, text for the terminal, and the page `poses.html`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +19,22 @@ from sharpfield.report.tables import TextTable
 
 
 def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
-    """Plain values, ready for JSON.
+    """Plain values for JSON.
 
-    Lengths are in units of the new world. Errors are distances, in px, between where points were
-    seen and where they project.
+    Lengths are in units of the new world. Errors are reprojection errors in px.
     """
-    made, sharp, mapped = found.capture, found.sharp, found.map
+    made, images, mapped = found.capture, found.images, found.map
     there = mapped.registered
     camera = made.camera
-    known = None if sharp.found is None else sharp.found.thresholds
-    names = original.needed_frames.names
+    known = None if images.found is None else images.found.thresholds
+    names, errors = original.needed_frames.names, found.errors
     return {
         "capture": original.name,
-        "images_from": sharp.source,
+        "images_from": images.source,
         "thresholds": None
         if known is None
         else {"negative": known.negative, "positive": known.positive},
-        "images": len(sharp),
+        "images": len(images),
         "registered": int(there.sum()),
         "frames": {
             "before": len(original.needed_frames),
@@ -58,26 +58,29 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
             "distortion": list(camera.distortion),
         },
         "bounds": {"near": _rounded(made.near, 4), "far": _rounded(made.far, 4)},
-        "off_known_positions": found.off_known,
+        "off_known_positions": None if errors is None else errors.absolute.translation,
+        "pose_errors": None if errors is None else asdict(errors),
         "relief": _relief(found),
         "each": _each(original, found),
     }
 
 
 def as_text(about: dict[str, Any]) -> str:
-    """The summary in lines for a terminal; every image that failed says why and what to do."""
+    """The summary as text for the terminal; each failed image with its reason and what to do."""
     frames, points, camera = about["frames"], about["points"], about["camera"]
     lines = [
         f"{about['registered']} of {about['images']} images have a pose"
-        f" (taken from {about['images_from']}), {about['error_px']} px off on average",
-        f"{points['map']} points, each seen in {points['mean_track_length']} images",
+        f" (taken from {about['images_from']}), {about['error_px']} px mean reprojection error",
+        f"{points['map']} points, each observed in {points['mean_track_length']} images",
         f"focal length {camera['focal_px'][0]} px ({camera['from']}), depth"
         f" {about['bounds']['near']} to {about['bounds']['far']}",
         f"{frames['after']} of {frames['before']} frames are in the new capture:"
         f" {frames['train']} to train, {frames['test']} held out",
     ]
     if about["off_known_positions"] is not None:
-        lines.append(f"camera centres are {about['off_known_positions']:.4g} from the known ones")
+        lines.append(
+            f"camera centres differ by {about['off_known_positions']:.4g} (RMS) from the known ones"
+        )
     if about["relief"] is not None and about["relief"]["flat"]:
         lines.append(f"warning: {about['relief']['why']}")
         lines.append(f"  do     {about['relief']['do']}")
@@ -92,29 +95,29 @@ def _relief(found: PosesFound) -> dict[str, Any] | None:
     shown = found.relief
     if shown is None:
         return None
-    told = advice(shown, found.intrinsics)
+    warning = advice(shown, found.intrinsics)
     return {
         "flat": shown.flat,
         "off_plane": _rounded(shown.off_plane, 4),
         "tolerance_px": _rounded(shown.tolerance_px, 3),
         "thickness": _rounded(shown.thickness, 4),
         "pairs": shown.pairs,
-    } | ({} if told is None else {"why": told[0], "do": told[1]})
+    } | ({} if warning is None else {"why": warning[0], "do": warning[1]})
 
 
 def _each(original: Capture, found: PosesFound) -> list[dict[str, Any]]:
-    sharp, mapped, seen = found.sharp, found.map, found.seen
-    points = np.bincount(mapped.observations[:, 0], minlength=len(sharp))
+    images, mapped, counts = found.images, found.map, found.counts
+    points = np.bincount(mapped.observations[:, 0], minlength=len(images))
     failures = {failure.image: failure for failure in found.failures}
     rows = []
-    for i in range(len(sharp)):
+    for i in range(len(images)):
         row: dict[str, Any] = {
-            "frame": original.needed_frames.names[sharp.frame[i]],
-            "time_us": int(sharp.time_us[i]),
+            "frame": original.needed_frames.names[images.frame[i]],
+            "time_us": int(images.time_us[i]),
             "registered": bool(mapped.registered[i]),
-            "features": int(seen.features[i]),
-            "matches": int(seen.matches[i]),
-            "partners": int(seen.partners[i]),
+            "features": int(counts.features[i]),
+            "matches": int(counts.matches[i]),
+            "partners": int(counts.partners[i]),
             "points": int(points[i]),
             "error_px": _rounded(mapped.error_px[i], 3) if mapped.registered[i] else None,
         }
@@ -217,7 +220,7 @@ def _images(about: dict[str, Any]) -> TextTable:
 
 
 def _view(original: Capture, found: PosesFound, image: int) -> ComparedView:
-    frames, frame = original.needed_frames, int(found.sharp.frame[image])
+    frames, frame = original.needed_frames, int(found.images.frame[image])
     name = frames.names[frame]
     recorded = np.rint(np.asarray(frames.images[frame], np.float64) * (255 / frames.white))
     caption = (
@@ -238,7 +241,7 @@ def _view(original: Capture, found: PosesFound, image: int) -> ComparedView:
 
 def _marked(found: PosesFound, image: int) -> UInt8[np.ndarray, "h w 3"]:
     """The image with the points of the map projected into it."""
-    shown = np.ascontiguousarray(_enlarged(found.sharp.images[image]))
+    shown = np.ascontiguousarray(_enlarged(found.images.images[image]))
     if not found.map.registered[image]:
         return shown
     rows = found.map.observations[found.map.observations[:, 0] == image, 1]
