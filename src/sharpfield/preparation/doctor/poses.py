@@ -74,13 +74,8 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
         sharp.images[rows], max(matches, key=len), capture.camera, poses
     )
     got = f"median {given:.2f} px from the epipolar lines, {count} matches of {len(matches)} pairs"
-    differs = abs(np.log(FACTORS[best])) > MIN_DIFFERENCE
-    if (
-        given > FINE_PX
-        and differs
-        and errors[best] < MAX_ERROR_RATIO * given
-        and errors[best] < POOR_PX
-    ):
+    differs = given > FINE_PX and abs(np.log(FACTORS[best])) > MIN_DIFFERENCE
+    if differs and errors[best] < min(MAX_ERROR_RATIO * given, POOR_PX):
         unknown = capture.known.intrinsics == "unknown"
         checkup.add(
             "warning" if unknown else "error",
