@@ -46,7 +46,7 @@ def test_without_alignment_the_model_develops():
     brightness = Brightness(lambda light: light * 2)
     assert brightness.image(torch.full((1, 1, 3), 0.4)).tolist() == [[pytest.approx([0.8] * 3)]]
     assert brightness.image(torch.full((1, 1, 3), 0.9)).max() == 1
-    assert brightness.words() is None
+    assert brightness.stated() is None
 
 
 def test_without_references_nothing_is_aligned():

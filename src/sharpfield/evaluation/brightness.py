@@ -1,10 +1,10 @@
-"""From a model's linear light to images that may be compared with stored ones.
+"""From the linear light of a model to images in the display domain.
 
-A model that saw frames develops its own light. Events alone report changes of log intensity, so a
-field learned from nothing else knows its light up to an unknown offset and an unknown gain (the
-contrast threshold) of the logarithm. Before comparing, one line per channel is fitted that takes
-the log of rendered light to the log of stored values, over all compared images at once; it
-absorbs any power-law tone curve as well. A sensor without colour filters knows luma only.
+A model trained on frames has a tone curve. Events report changes of log intensity only, so a model
+trained on events alone has an unknown offset and an unknown gain (the contrast threshold) of the
+log intensity. Before comparing, one line per channel is fitted from the log of rendered light to
+the log of stored values, over all compared images at once; it absorbs any power-law tone curve as
+well. A sensor without colour filters gives luma only.
 
 Source: the evaluation of EventNeRF (CVPR 2023) and of the event-based fields that followed it.
 """
@@ -20,7 +20,7 @@ from torch import Tensor
 from sharpfield.core.tone import luma
 
 DARK = 1e-3
-"""Values below this count as this: the logarithm of nearly nothing would rule the fit."""
+"""Smallest value before the logarithm: values near zero would dominate the fit."""
 
 Image = Float[Tensor, "h w c"]
 
@@ -33,23 +33,23 @@ class LogAffine:
     offset: Float[Tensor, "c"]
 
     def __call__(self, light: Image) -> Image:
-        """Rendered light as the frames would store it."""
+        """Rendered light as stored values."""
         return (self.gain * light.clamp_min(DARK).log() + self.offset).exp()
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """How light becomes a image, and in which channels images are compared."""
+    """Conversion of light to images, and the channels in which images are compared."""
 
     encode: Callable[[Tensor], Tensor]
-    """As the frames store light, if the model knows that."""
+    """Tone curve of the model."""
     aligned: LogAffine | None = None
-    """Used instead, if it does not."""
+    """Used instead of the tone curve, if given."""
     grey: bool = False
     """Whether only luma is compared."""
 
     def image(self, light: Image) -> Float[Tensor, "h w d"]:
-        """Display domain, 0...1, not quantised."""
+        """Rendered light in the display domain, 0...1, not quantised."""
         light = self.reference(light)
         return (self.encode(light) if self.aligned is None else self.aligned(light)).clamp(0, 1)
 
@@ -57,8 +57,8 @@ class Brightness:
         """An image in the channels that are compared."""
         return luma(image)[..., None] if self.grey else image
 
-    def words(self) -> dict[str, Any] | None:
-        """For the protocol; None if nothing was aligned."""
+    def stated(self) -> dict[str, Any] | None:
+        """Entry of the protocol; None if nothing was aligned."""
         if self.aligned is None:
             return None
         return {
@@ -74,12 +74,12 @@ def fit_brightness(
     *,
     grey: bool,
 ) -> Brightness:
-    """The brightness of a model of events alone.
+    """The aligned brightness of a model trained on events alone.
 
     Args:
-        encode: Used where there is nothing to align to.
+        encode: Tone curve, used where there is nothing to align to.
         compared: Pairs of rendered light and reference.
-        grey: The sensor had no colour filters.
+        grey: Whether the sensor has no colour filters.
     """
     plain = Brightness(encode, grey=grey)
     if not compared:
@@ -93,9 +93,9 @@ def fit_log_affine(light: Sequence[Image], stored: Sequence[Image]) -> LogAffine
     """The line per channel with the least squared error in log intensity, over all images."""
     x = torch.cat([image.flatten(0, 1) for image in light]).double().clamp_min(DARK).log()
     y = torch.cat([image.flatten(0, 1) for image in stored]).double().clamp_min(DARK).log()
-    from_x = x - x.mean(0)
-    spread = from_x.square().sum(0)
-    slope = (from_x * (y - y.mean(0))).sum(0) / spread.clamp_min(torch.finfo(x.dtype).tiny)
-    # A render of one single brightness fixes no gain.
-    gain = torch.where(spread > 0, slope, torch.zeros_like(slope))
+    centred = x - x.mean(0)
+    variance = centred.square().sum(0)
+    slope = (centred * (y - y.mean(0))).sum(0) / variance.clamp_min(torch.finfo(x.dtype).tiny)
+    # Renders of constant brightness do not determine a gain.
+    gain = torch.where(variance > 0, slope, torch.zeros_like(slope))
     return LogAffine(gain.float(), (y.mean(0) - gain * x.mean(0)).float())

@@ -1,8 +1,8 @@
-"""Event frames of held-out cameras: predicted changes of light, and recorded ones.
+"""Metrics of event frames of held-out cameras: predicted against recorded changes.
 
-An *event frame* holds, for each pixel, the change of log intensity in a window of time: as a model
-predicts it, or as the signed count of events times their thresholds. Windows never reach from one
-camera to another. All numbers are means over event frames.
+An *event frame* holds, for each pixel, the change of log intensity in a time window: predicted by a
+model, or the signed count of events times their thresholds. Each window belongs to one camera. All
+metrics are means over event frames.
 
 Source: EvDNeRF (WACV 2024) and its released evaluation for PSNR, SSIM and MAE of event frames.
 """
@@ -177,13 +177,13 @@ def event_scores(
     windows: int = WINDOWS,
     lengths: Sequence[float] = LENGTHS,
 ) -> dict[str, Any] | None:
-    """Scores of each length of window; None if the capture holds no event camera out.
+    """Metrics for each window length; None if the capture holds out no event camera.
 
     Args:
         model: Trained.
         capture: On the same clock as the model's own.
-        windows: How many of each camera.
-        lengths: In shares of the capture; windows of all lengths begin at the same times.
+        windows: Windows of each camera.
+        lengths: Shares of the capture; windows of all lengths start at the same times.
     """
     if capture.test_events is None or not len(capture.test_events):
         return None
@@ -194,8 +194,8 @@ def event_scores(
             first = log_intensity(model, int(track), float(start))
             for length in lengths:
                 change = log_intensity(model, int(track), float(start + length)) - first
-                counted = count_recorded(capture, index, int(track), (start, start + length))
-                pairs[length].append((change, counted))
+                counts = count_recorded(capture, index, int(track), (start, start + length))
+                pairs[length].append((change, counts))
     return {
         "definitions": {metric.name: metric.definition for metric in EVENT_METRICS},
         "lengths": {f"{length:.5g}": _scores(pairs[length], capture) for length in lengths},
@@ -208,19 +208,21 @@ def log_intensity(model: Model, track: int, time: float) -> Float[Tensor, "h w"]
     A model without a response of its own gets the logarithm of luma above the floor of `formation`.
     """
     own = model.capture
-    home = device_of(own.trajectory)
-    pose = own.trajectory.pose(torch.tensor(time, device=home), torch.tensor(track, device=home))
+    device = device_of(own.trajectory)
+    pose = own.trajectory.pose(
+        torch.tensor(time, device=device), torch.tensor(track, device=device)
+    )
     pose = pose.detach().to(device_of(model))
-    seen = render_view(renderer_of(model), own.camera, pose, time).rgb
+    light = render_view(renderer_of(model), own.camera, pose, time).rgb
     if isinstance(model, HasLogLight):
-        return model.log_light(seen.to(device_of(model))).detach().cpu()
-    return (luma(seen) + FLOOR).log()
+        return model.log_light(light.to(device_of(model))).detach().cpu()
+    return (luma(light) + FLOOR).log()
 
 
 def count_recorded(
     capture: Capture, index: EventIndex, track: int, window: tuple[float, float]
 ) -> Float[Tensor, "2 h w"]:
-    """How many events to darker and to brighter each pixel reported."""
+    """Number of events to darker and to brighter at each pixel."""
     start_us, end_us = (int(capture.clock.us(t)) + 1 for t in window)
     camera = capture.camera
     counts = window_image(

@@ -1,8 +1,8 @@
-"""Videos of event frames: what a held-out event camera recorded, and what a model predicts for it.
+"""Videos of event frames of held-out event cameras, recorded beside predicted.
 
-A video shows windows one after the other, recorded on the left, predicted on the right, in one
-scale. The prediction is the published one, the change of log light between the ends of a window in
-whole thresholds; the `events` command renders streams.
+A video shows one window after the other, recorded on the left, predicted on the right, in one
+scale. The prediction is the published one: the change of log light over a window in whole
+thresholds. (The `events` command renders event streams instead.)
 
 Source: EvDNeRF (WACV 2024), figures and videos of event frames.
 """
@@ -29,15 +29,15 @@ from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
 
 CAMERAS = 2
-"""Most cameras recorded as videos, evenly spread over those held out."""
+"""Most cameras with a video, evenly spread over those held out."""
 WINDOWS = 20
-"""Of a video; together they last as long as the capture."""
+"""Windows of a video; together they cover the capture."""
 RATE = 8.0
 """Windows per second."""
-HIGH_PX = 240
-"""Smaller images are enlarged by a whole number of times up to this height."""
+HEIGHT_PX = 240
+"""Smaller images are enlarged by a whole factor up to this height."""
 GAP_PX = 4
-"""Between the two."""
+"""Gap between the two images."""
 
 Rgb = UInt8[np.ndarray, "height width 3"]
 
@@ -92,14 +92,14 @@ def events_section(run: Path, metrics: Mapping[str, Any]) -> dict[str, Any] | No
 
 
 def _images(model: Model, capture: Capture, track: int) -> list[Rgb]:
-    """Both frames of each window."""
+    """Recorded and predicted event frame of each window side by side."""
     assert capture.test_events is not None
     index = event_index(capture.test_events)
     ends = np.linspace(0, 1, WINDOWS + 1)
-    views = [log_intensity(model, track, float(time)) for time in ends]
+    log_images = [log_intensity(model, track, float(time)) for time in ends]
     predicted = [
         ((after - before) / mean_threshold(capture)).trunc().numpy()
-        for before, after in zip(views, views[1:], strict=False)
+        for before, after in zip(log_images, log_images[1:], strict=False)
     ]
     counts = [
         count_recorded(capture, index, track, (float(a), float(b))).numpy()
@@ -114,8 +114,8 @@ def _images(model: Model, capture: Capture, track: int) -> list[Rgb]:
 
 
 def _beside(left: Rgb, right: Rgb) -> UInt8[np.ndarray, "high wide 3"]:
-    """Both, enlarged."""
-    times = max(HIGH_PX // left.shape[0], 1)
-    left, right = (np.kron(one, np.ones((times, times, 1), np.uint8)) for one in (left, right))
+    """Two images side by side, enlarged."""
+    factor = max(HEIGHT_PX // left.shape[0], 1)
+    left, right = (np.kron(one, np.ones((factor, factor, 1), np.uint8)) for one in (left, right))
     gap = np.full((left.shape[0], GAP_PX, 3), 128, np.uint8)
     return np.concatenate([left, gap, right], 1)

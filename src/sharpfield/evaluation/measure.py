@@ -1,11 +1,11 @@
-"""How good a trained model is: its views against images it has not seen, and sharp truth.
+"""Evaluation of a trained model: renders against held-out images, and against sharp truth.
 
-`RUN/metrics.json` says under which protocol each number was measured; `RUN/renders/` holds the
-images. Images are compared in the display domain, as the frames store them.
+`RUN/metrics.json` states the protocol of each number; `RUN/renders/` holds the images. Images are
+compared in the display domain, as the frames store them.
 
-A render is made from the middle of a frame's exposure, in the model's own space. The capture that
-is compared with may hold more than the model was trained on (frames, say, for a model that saw
-only events), as long as both have the same clock.
+Views are rendered at the middle of the exposure of a frame, in the model's world. The capture that
+is compared with may hold more than the model was trained on (frames, for a model trained on events
+alone), as long as both have the same clock.
 """
 
 import json
@@ -128,7 +128,7 @@ def evaluate(
     metrics: dict[str, Any] = {
         "protocol": {
             **describe(capture, test, lpips, too_small=too_small),
-            "alignment": brightness.words(),
+            "alignment": brightness.stated(),
             "compared_as": "luma" if brightness.grey else "all channels",
             **options.stated,
         },
@@ -261,7 +261,7 @@ def _training(run: Path) -> dict[str, Any]:
         written = json.loads(path.read_text())
         return {name: written.get(name) for name in cost}
     except (ValueError, AttributeError) as error:
-        raise RunError("cannot be read", where=path, got=error, do="train anew") from None
+        raise RunError("cannot be read", where=path, got=error, do="train again") from None
 
 
 def _expect_same_size(model: Model, capture: Capture) -> None:

@@ -1,4 +1,4 @@
-"""The protocol: everything one must know to measure the same numbers again."""
+"""The protocol: everything that is needed to reproduce the metrics."""
 
 import platform
 from collections import Counter
@@ -25,13 +25,13 @@ ENABLE_LPIPS = (
 def describe(
     capture: Capture, test: Sequence[Reference], lpips: Lpips | None, *, too_small: bool = False
 ) -> dict[str, Any]:
-    """The part of the protocol that the capture and the definitions fix.
+    """The part of the protocol that depends on the capture and on the definitions.
 
     Args:
-        capture: What is compared with.
+        capture: The capture that is compared with.
         test: The held-out references.
         lpips: None if it is not computed.
-        too_small: It is not, because the images are too small for its network.
+        too_small: LPIPS is not computed because the images are too small for its network.
     """
     frames = capture.frames
     return {
@@ -61,7 +61,7 @@ def describe(
 
 
 def _defined() -> list[Metric]:
-    """Metrics whose definition is stated in one place: those of held-out images."""
+    """Metrics of held-out images; those of events have their definitions beside their values."""
     return [*view_metrics().values(), PSNR_ALIGNED, DEPTH_ERROR]
 
 

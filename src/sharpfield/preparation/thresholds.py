@@ -43,7 +43,7 @@ class FoundThresholds:
 
 
 def known_thresholds(capture: Capture) -> FixedThresholds | None:
-    """What the source of the capture says of both signs; None if it is silent."""
+    """Thresholds that the capture states; None if it states none."""
     known = capture.known.thresholds
     return None if known is None else FixedThresholds(known.negative, known.positive)
 

@@ -124,7 +124,7 @@ def _timed(
     capture: Capture, path: ExternalPath, poses: Float64[np.ndarray, "p 3 4"], mount: Mount
 ) -> FramesOnPath:
     """Everything that the path covers; there must be one camera."""
-    assert path.times_us is not None, "the caller looked"
+    assert path.times_us is not None, "checked by the caller"
     stamps = path.times_us + mount.offset_us
     laid_path = Stamped(stamps, poses, capture.clock)
     frames = capture.frames
@@ -139,7 +139,7 @@ def _timed(
         return FramesOnPath(None, laid_path, np.zeros(0, np.int64), np.zeros(1, np.int64))
     if len(np.unique(frames.track)) > 1:
         raise CaptureError(
-            "a file of one path cannot place several cameras",
+            "a file of one path cannot give poses to several cameras",
             where=capture.name,
             got=f"{len(np.unique(frames.track))} tracks",
             do="give a COLMAP model, whose poses belong to images",

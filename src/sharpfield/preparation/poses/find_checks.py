@@ -63,14 +63,14 @@ def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | No
     if shown is None or not shown.flat:
         return None
     lens = intrinsics != "given"
-    said = (
+    warning = (
         f"the scene is nearly flat: in distant images a plane explains"
         f" {100 * (1 - shown.off_plane):.0f} % of the points to {shown.tolerance_px:.1f} px, and"
         f" half of them are within {100 * shown.thickness:.1f} % of their depth from one plane;"
         f" camera positions{' and the focal length' if lens else ''} may be off by a tenth"
     )
     known = "give the focal length (ingest with --calibration, then --intrinsics given); "
-    return said, (
+    return warning, (
         f"{known if lens else ''}refine poses in training (train ev-splat --preset refine); record"
         " objects at other depths, and move farther sideways"
     )
