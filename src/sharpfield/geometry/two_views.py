@@ -1,8 +1,8 @@
-"""Two views of a scene, compared without knowing their poses, and judged by poses claimed for them.
+"""Epipolar geometry of two views: matches found without poses, and poses checked against them.
 
-Details are matched by description alone and kept if some geometry of two views explains them. Then
-the poses and the lens of a capture are asked whether they agree: each match must lie on the line
-that they say. How far it is off, in px, is the *Sampson distance*.
+Features are matched by their descriptors alone and kept if one fundamental matrix explains them.
+Then the poses and the lens of a capture are checked: each match must lie on the *epipolar line*
+that they predict. Its distance from the line, in px, is the *Sampson distance*.
 
 Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 9.6, 11.4 and 12.2.
 """
@@ -10,82 +10,77 @@ Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 9.6, 11
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
 from sharpfield.core.camera import Camera
+from sharpfield.geometry.features import (
+    Features,
+    mutual_matches,
+    sift_features,
+    squared_differences,
+)
 
-MOST_FEATURES = 3000
-FAINTEST = 0.015
-RATIO = 0.8
-"""Best difference of two descriptions, relative to the second best."""
+MAX_FEATURES = 3000
+"""Of one image."""
+MIN_CONTRAST = 0.015
+"""Of a feature."""
 TOLERANCE_PX = 2.0
-"""Distance from the line that any geometry of two views says."""
-LEAST_MATCHES = 16
-
-
-@dataclass(frozen=True)
-class Details:
-    """Features of one image."""
-
-    xy: Float64[np.ndarray, "m 2"]
-    """In px, the centre of the first one at 0.5."""
-    about: Float32[np.ndarray, "m 128"]
+"""Distance from the epipolar line of the fundamental matrix that is fitted to matches."""
+MIN_MATCHES = 16
 
 
 @dataclass(frozen=True)
 class PairMatches:
-    """What two images both show."""
+    """Matched features of two images."""
 
     pair: tuple[int, int]
     xy: Float64[np.ndarray, "m 2 2"]
     """In the first and in the second image."""
 
     def __len__(self) -> int:
-        """How many details."""
+        """How many matches."""
         return len(self.xy)
 
 
-def find_details(images: UInt8[np.ndarray, "n h w c"]) -> list[Details]:
-    """Features of each image."""
-    sift = cv2.SIFT_create(  # pyright: ignore
-        MOST_FEATURES, contrastThreshold=FAINTEST, enable_precise_upscale=True
-    )
-    found = []
-    for image in images:
-        grey = np.ascontiguousarray(image.mean(-1).round().astype(np.uint8))
-        points, about = sift.detectAndCompute(grey, None)
-        xy = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
-        about = np.zeros((0, 128), np.float32) if about is None else about
-        _, first = np.unique(xy, axis=0, return_index=True)
-        root = np.sqrt(about / np.maximum(about.sum(-1, keepdims=True), 1e-9))
-        found.append(Details(xy[first], root[first].astype(np.float32)))
-    return found
+def find_features(images: UInt8[np.ndarray, "n h w c"]) -> list[Features]:
+    """SIFT features of each image, with root descriptors."""
+    grey = (image.mean(-1).round().astype(np.uint8) for image in images)
+    return sift_features(grey, most=MAX_FEATURES, contrast=MIN_CONTRAST, root=True)
 
 
 def match_pairs(
-    details: Sequence[Details], pairs: Sequence[tuple[int, int]], *, seed: int = 0
+    features: Sequence[Features], pairs: Sequence[tuple[int, int]], *, seed: int = 0
 ) -> list[PairMatches]:
-    """Matches of each pair that some geometry of two views explains, unless they are few."""
+    """Matches of each pair that one fundamental matrix explains; pairs with few are left out.
+
+    Args:
+        features: Of each image.
+        pairs: Images to compare, by index.
+        seed: Of the random sampling in the fit.
+    """
+    import cv2
+
     cv2.setRNGSeed(seed)
     found = []
     for pair in pairs:
-        one, two = (details[i] for i in pair)
-        rows = _alike(one.about, two.about)
-        if len(rows) < LEAST_MATCHES:
+        one, two = (features[i] for i in pair)
+        rows = mutual_matches(squared_differences(one, two))
+        if len(rows) < MIN_MATCHES:
             continue
         xy = np.stack([one.xy[rows[:, 0]], two.xy[rows[:, 1]]], 1)
-        good = _of_one_geometry(xy)
-        if good is None or good.sum() < LEAST_MATCHES:
+        good = _epipolar_inliers(xy)
+        if good is None or good.sum() < MIN_MATCHES:
             continue
         found.append(PairMatches(pair, xy[good[:, 0] > 0]))
     return found
 
 
-def _of_one_geometry(xy: Float64[np.ndarray, "m 2 2"]) -> UInt8[np.ndarray, "m 1"] | None:
-    """Which matches the best geometry of two views explains; None if there is none."""
+def _epipolar_inliers(xy: Float64[np.ndarray, "m 2 2"]) -> UInt8[np.ndarray, "m 1"] | None:
+    """Which matches the best fundamental matrix explains; None if there is none."""
+    import cv2
+
     for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
         try:
             return cv2.findFundamentalMat(
@@ -101,7 +96,7 @@ def sampson_px(
     camera: Camera,
     poses: Float64[np.ndarray, "n 3 4"],
 ) -> Float64[np.ndarray, "m"]:
-    """How far matches are from the lines that poses and lens say."""
+    """Sampson distance of matches from the epipolar lines that poses and lens predict."""
     rays = [_on_plane(camera, matches.xy[:, i]) for i in (0, 1)]
     one, two = (poses[i] for i in matches.pair)
     turn = two[:, :3].T @ one[:, :3]
@@ -137,21 +132,6 @@ def pairs_apart(poses: Float64[np.ndarray, "n 3 4"], *, most: int) -> list[tuple
     order = np.argsort(-away[first, second], kind="stable")
     chosen = order[: max(2 * most, 1)][::2] if len(order) > most else order
     return [(int(first[i]), int(second[i])) for i in chosen[:most]]
-
-
-def _alike(
-    one: Float32[np.ndarray, "m 128"], two: Float32[np.ndarray, "k 128"]
-) -> Int64[np.ndarray, "r 2"]:
-    """Rows that are each other's best match, clearly better than the second best."""
-    if len(one) < 2 or len(two) < 2:
-        return np.zeros((0, 2), np.int64)
-    unlike = 2 - 2 * np.minimum(one @ two.T, 1)
-    best = unlike.argmin(-1)
-    two_least = np.partition(unlike, 1, axis=-1)[:, :2]
-    clear = two_least[:, 0] < RATIO**2 * two_least[:, 1]
-    mutual = unlike.argmin(0)[best] == np.arange(len(one))
-    rows = np.flatnonzero(clear & mutual)
-    return np.stack([rows, best[rows]], -1)
 
 
 def _on_plane(camera: Camera, xy: Float64[np.ndarray, "m 2"]) -> Float64[np.ndarray, "m 3"]:

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
-from sharpfield.geometry.two_views import PairMatches, find_details, match_pairs, sampson_px
+from sharpfield.geometry.two_views import PairMatches, find_features, match_pairs, sampson_px
 from sharpfield.preparation.doctor.findings import Checkup, Curve
 from sharpfield.preparation.poses.images import SfmImages, sfm_images
 
@@ -47,7 +47,7 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
     rows = np.flatnonzero(np.isin(sharp.frame, chosen))
     poses = _poses(capture, sharp)[rows]
     pairs = [(i, j) for i in range(len(rows)) for j in range(i + 1, len(rows))]
-    matches = match_pairs(find_details(sharp.images[rows]), pairs)
+    matches = match_pairs(find_features(sharp.images[rows]), pairs)
     count = sum(len(one) for one in matches)
     if count < MIN_MATCHES:
         checkup.add(

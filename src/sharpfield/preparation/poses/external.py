@@ -17,7 +17,7 @@ from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.geometry.two_views import depths_of, find_details, match_pairs, pairs_apart
+from sharpfield.geometry.two_views import depths_of, find_features, match_pairs, pairs_apart
 from sharpfield.preparation.poses.find import events_on_path, split_of
 from sharpfield.preparation.poses.images import sfm_images
 from sharpfield.preparation.poses.path import FramesOnPath, frames_of, path_through
@@ -233,7 +233,7 @@ def _seen_bounds(capture: Capture) -> tuple[float, float]:
     poses = capture.trajectory.pose(time, track).detach().double().numpy()
     pairs = pairs_apart(poses, most=PAIRS)
     found = []
-    for matches in match_pairs(find_details(sharp.images), pairs):
+    for matches in match_pairs(find_features(sharp.images), pairs):
         depth, sure = depths_of(matches, capture.camera, poses)
         found += depth[sure].tolist()
     if not found:
