@@ -209,7 +209,8 @@ def test_a_damaged_status_is_named(tmp_path: Path):
 
 
 def start_process(run: Path, *more: str, steps: int = 30) -> subprocess.Popen:
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    source = str(Path(toy.__file__).parents[2] / "src")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": source}
     command = [sys.executable, toy.__file__, str(run), str(steps), "0.05", *more]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 

@@ -92,7 +92,7 @@ def _together(statuses: list[TrainingStatus]) -> TrainingStatus:
     steps = max(status.planned_steps for status in statuses)
     return TrainingStatus(
         planned_steps=steps,
-        parts=1,
+        micro_batches=1,
         device=statuses[0].device,
         steps=steps,
         seconds=sum(status.seconds for status in statuses),

@@ -225,7 +225,9 @@ def _unpacked(header: str | None, path: Path) -> tuple[str, Progress]:
         return written["checksum"], Progress(**written["progress"])
     except (ValueError, TypeError, KeyError):
         raise RunError(
-            "not a checkpoint of sharpfield", where=path, do="name a run's own folder"
+            "not a checkpoint of sharpfield, or one of another version",
+            where=path,
+            do=f"name a run's own folder, or {START_AGAIN}",
         ) from None
 
 
