@@ -131,10 +131,10 @@ def test_options_are_changed_by_name(capture: sf.Capture, tmp_path: Path) -> Non
         out=tmp_path / "run",
         steps=2,
         device="cpu",
-        options={"gaussians.degree": 0},
+        options={"gaussians.sh_degree": 0},
     )
-    assert run.config.recipe.gaussians.degree == 0
-    assert run.model.scene.gaussians.degree == 0
+    assert run.config.recipe.gaussians.sh_degree == 0
+    assert run.model.scene.static.sh_degree == 0
 
 
 @pytest.mark.parametrize(
@@ -150,8 +150,8 @@ def test_options_are_changed_by_name(capture: sf.Capture, tmp_path: Path) -> Non
         (lambda run: sf.simulate("gardn"), "(?s)unknown scene.*garden"),
         (lambda run: sf.simulate(size=(5, 5)), "not the size of a sensor"),
         (lambda run: sf.write(run.capture, "x", "colmapp"), "unknown layout to write"),
-        (lambda run: changed(run, {"gausians.degree": 1}), "did you mean gaussians"),
-        (lambda run: changed(run, {"gaussians.degree": "1"}), "(?s)type of value.*give int"),
+        (lambda run: changed(run, {"gausians.sh_degree": 1}), "did you mean gaussians"),
+        (lambda run: changed(run, {"gaussians.sh_degree": "1"}), "(?s)type of value.*give int"),
     ],
 )
 def test_what_is_wrong_is_said(run: sf.Run, wrong, said: str) -> None:
@@ -217,7 +217,7 @@ def test_a_run_has_an_event_camera(run: sf.Run, capture: sf.Capture) -> None:
 
 def test_a_run_gives_its_gaussians_and_a_video_away(run: sf.Run, tmp_path: Path) -> None:
     count = run.export(tmp_path / "scene.ply")
-    assert count == len(run.model.scene.gaussians)
+    assert count == len(run.model.scene.static)
     assert (tmp_path / "scene.ply").read_bytes().startswith(b"ply")
     assert run.video(tmp_path / "images", frames=2) == 2
     assert len(list((tmp_path / "images").glob("*.png"))) == 2
