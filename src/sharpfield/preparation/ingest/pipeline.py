@@ -366,7 +366,9 @@ class _Ingest:
         left_out: dict[str, int],
         clock: str,
     ) -> dict[str, Note]:
-        notes: dict[str, Note] = {**geometry.notes} | ({"clock": clock} if clock else {})
+        notes: dict[str, Note] = {**geometry.notes}
+        if clock:
+            notes["clock"] = clock
         if left_out:
             notes["left_out"] = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
         if event_filter is not None and len(event_filter.hot):

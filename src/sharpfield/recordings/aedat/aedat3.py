@@ -114,8 +114,8 @@ def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
 
     Args:
         path: The file.
-        options: `size`, where the camera's name does not tell it; `topic`, the number of one of
-            several sources.
+        options: `size`, where the camera's name does not determine it; `topic`, the number of one
+            of several sources.
 
     Raises:
         CaptureError: The file is no AEDAT3.1, or has several sources and none was chosen.
@@ -147,9 +147,9 @@ def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
 
 
 def _chosen(sources: dict[int, str], topic: str | None, path: Path) -> int:
-    asked = int(topic) if topic is not None and re.fullmatch("[0-9]{1,4}", topic) else None
-    if asked in sources:
-        return asked
+    chosen = int(topic) if topic is not None and re.fullmatch("[0-9]{1,4}", topic) else None
+    if chosen in sources:
+        return chosen
     if topic is None and len(sources) == 1:
         return next(iter(sources))
     raise CaptureError(
@@ -204,9 +204,9 @@ def _frame(data: bytes, since_us: int) -> Frame | None:
     info, _, _, opened, closed, width, height, left, top = FRAME_HEAD.unpack_from(data)
     channels = info >> 1 & 7
     count = width * height * channels
-    sound = info & 1 and channels in (1, 3, 4) and width > 0 and height > 0
-    sound = sound and FRAME_HEAD.size + 2 * count <= len(data)
-    if not sound or left or top or not 0 <= opened <= closed:
+    valid = info & 1 and channels in (1, 3, 4) and width > 0 and height > 0
+    valid = valid and FRAME_HEAD.size + 2 * count <= len(data)
+    if not valid or left or top or not 0 <= opened <= closed:
         return None
     pixels = np.frombuffer(data, "<u2", count, FRAME_HEAD.size)
     image = pixels.reshape(height, width, channels)
@@ -243,9 +243,9 @@ def _packet_header(file: BinaryIO, offset: int) -> PacketHeader | None:
     if len(data) < HEAD.size:
         return None
     found = PacketHeader(*HEAD.unpack(data))
-    sound = 0 < found.size and 0 <= found.time_at < found.size and found.overflow >= 0
-    sound = sound and 0 <= found.valid <= found.count <= found.capacity
-    return found if sound and found.size * found.count <= MAX_PACKET else None
+    valid = 0 < found.size and 0 <= found.time_at < found.size and found.overflow >= 0
+    valid = valid and 0 <= found.valid <= found.count <= found.capacity
+    return found if valid and found.size * found.count <= MAX_PACKET else None
 
 
 def _capacity(file: BinaryIO, offset: int, start: PacketHeader, length: int) -> int | None:

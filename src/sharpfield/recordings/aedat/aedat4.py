@@ -330,9 +330,9 @@ def _frame(table: Table, log: ReadLog) -> Frame | None:
         raise DamagedData("another number of pixels")
     image = stored.view(kind).reshape(height, width, channels)
     image = image[..., 0] if channels == 1 else image[..., 2::-1]
-    taken, opened, closed = (table.number(i, "q") for i in (0, 3, 4))
+    stamp_us, opened, closed = (table.number(i, "q") for i in (0, 3, 4))
     if not opened and not closed:
-        opened, closed = taken, taken + table.number(11, "q")
+        opened, closed = stamp_us, stamp_us + table.number(11, "q")
     if closed < opened:
         raise DamagedData("an exposure that ends before it begins")
     return Frame(image.astype(kind[-2:]), opened, closed)

@@ -128,8 +128,8 @@ def open_text(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recordin
 
     def events() -> Chunks:
         pass_log = log.start("events")
-        pieces = _raw_chunks(_from(header.length, read(pass_log)), layout, path, pass_log)
-        return merge_chunks(pieces, size, where=path, log=pass_log)
+        raw_chunks = _raw_chunks(_from(header.length, read(pass_log)), layout, path, pass_log)
+        return merge_chunks(raw_chunks, size, where=path, log=pass_log)
 
     return Recording(path, "text", size=size, events=events, log=log)
 
