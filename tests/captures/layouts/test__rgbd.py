@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.layout import ReadOptions
-from sharpfield.captures.layouts._rgbd import resized, usable_poses
+from sharpfield.captures.layouts._rgbd import downscaled_camera, usable_poses
 from sharpfield.captures.read import layout_of, read_capture
 from sharpfield.captures.writers import scannet as write_scannet
 from sharpfield.core.camera import Camera
@@ -109,7 +109,7 @@ def test_intrinsics_of_another_size_are_refused(tmp_path, poses, colours, depths
     matrix = np.diag([1170.0, 1170.0, 1, 1])
     matrix[:2, 2] = 648, 484
     np.savetxt(tmp_path / "intrinsic" / "intrinsic_color.txt", matrix)
-    with pytest.raises(CaptureError, match="the intrinsics are not those of the images"):
+    with pytest.raises(CaptureError, match="the intrinsics do not belong to the images"):
         read_capture(tmp_path)
 
 
@@ -120,11 +120,11 @@ def test_no_pose_at_all_is_an_error(tmp_path, poses, colours, depths):
 
 
 def test_large_colour_is_brought_to_the_published_size():
-    camera = resized(Camera(1296, 968, 1170.0, 1172.0, 648.0, 484.0), (640, 480))
+    camera = downscaled_camera(Camera(1296, 968, 1170.0, 1172.0, 648.0, 484.0), (640, 480))
     assert camera.size == (640, 480)
     np.testing.assert_allclose([camera.fx_px, camera.fy_px], [577.7778, 581.157], atol=1e-3)
     small = Camera(320, 240, 300.0, 300.0, 160.0, 120.0)
-    assert resized(small, (640, 480)) is small
+    assert downscaled_camera(small, (640, 480)) is small
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,9 @@ def test_large_colour_is_brought_to_the_published_size():
 )
 def test_large_colour_of_other_shapes_keeps_its_shape(size, expected):
     width, height = size
-    camera = resized(Camera(width, height, 900.0, 900.0, width / 2, height / 2), (640, 480))
+    camera = downscaled_camera(
+        Camera(width, height, 900.0, 900.0, width / 2, height / 2), (640, 480)
+    )
     assert camera.size == expected
     np.testing.assert_allclose(camera.fx_px / camera.fy_px, 1, atol=0.01)
     np.testing.assert_allclose([camera.cx_px, camera.cy_px], np.array(expected) / 2)
@@ -173,7 +175,7 @@ def test_what_is_written_for_scannet_is_read_again(panning, tmp_path):
 
 def test_scannet_has_no_place_for_events(panning, tmp_path):
     capture = replace(with_depth(panning), events=panning.events)
-    with pytest.raises(CaptureError, match="the layout scannet has no place for events"):
+    with pytest.raises(CaptureError, match="the layout scannet cannot store events"):
         write_scannet.write(capture, tmp_path / "scene")
     with pytest.raises(CaptureError, match="needs measured depth"):
         write_scannet.write(panning.without(events=True), tmp_path / "scene")
@@ -211,7 +213,7 @@ def test_sens(tmp_path, poses, colours, depths):
 
 @pytest.mark.parametrize(
     ("damage", "message"),
-    [({"cut": 5}, "ends too early"), ({"version": 3}, "not a .sens file of the version")],
+    [({"cut": 5}, "ends too early"), ({"version": 3}, "unsupported version of a .sens file")],
 )
 def test_broken_sens_files(tmp_path, poses, colours, depths, damage, message):
     sens(tmp_path / "scene.sens", poses, colours, depths, **damage)

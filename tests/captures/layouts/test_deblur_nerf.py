@@ -93,7 +93,7 @@ def test_cropped_images_are_refused(tmp_path):
         (lambda rows: rows * np.where(np.arange(17) == 10, -1, 1), "not orthonormal"),
         (lambda rows: np.where(np.arange(17) == 3, np.nan, rows), "NaN"),
         (lambda rows: np.where(np.arange(17) == 15, -1, rows), "0 < near < far"),
-        (lambda rows: rows + np.arange(9)[:, None] * (np.arange(17) == 14), "must agree in size"),
+        (lambda rows: rows + np.arange(9)[:, None] * (np.arange(17) == 14), "must have one size"),
     ],
 )
 def test_bad_pose_tables_are_refused(tmp_path, change, message):

@@ -170,7 +170,7 @@ def test_a_threshold_that_does_not_fit_is_told(folder: Path) -> None:
         path.unlink()
     with pytest.raises(CaptureError, match="not a whole number of thresholds") as caught:
         read_capture(folder, ReadOptions(threshold=0.3))
-    assert "give the contrast threshold" in str(caught.value)
+    assert "give the option `threshold`" in str(caught.value)
     np.testing.assert_array_equal(  # half the size, twice the events
         sums(read_capture(folder, ReadOptions(threshold=0.1)).needed_events, 0, 0),
         2 * sums(read_capture(folder).needed_events, 0, 0),
@@ -193,9 +193,10 @@ def test_pickled_streams_are_left_alone_otherwise(rig: Capture, folder: Path) ->
     with pytest.raises(CaptureError) as caught:
         read_capture(folder)
     assert str(caught.value) == (
-        "CaptureError: the event streams are pickled: opening such a file may run what is in it\n"
+        "CaptureError: the event streams are pickled: opening such a file may"
+        " run code that it contains\n"
         f"  where  {path}\n"
-        "  do     if you trust where it comes from, say so with --trust-pickle"
+        "  do     if you trust its source, give --trust-pickle"
         " (`trust_pickle=True`); or save it with np.savez, one array for each view"
     )
 
@@ -244,7 +245,7 @@ def test_events_alone_are_enough(folder: Path) -> None:
             lambda about: about["frames"][3].update(
                 transform_matrix=about["frames"][20]["transform_matrix"]
             ),
-            "a view must stand still",
+            "the camera of a view must not move",
         ),
     ],
 )
@@ -260,7 +261,7 @@ def test_malformed_transforms_are_told(folder: Path, change, message: str) -> No
 def test_sums_of_another_shape_are_told(folder: Path) -> None:
     (folder / "data_train.npz").unlink()
     np.save(folder / "data_frames_train.npy", np.zeros((2, 5, HEIGHT, WIDTH)))
-    with pytest.raises(CaptureError, match="do not fit the views") as caught:
+    with pytest.raises(CaptureError, match="do not match the views") as caught:
         read_capture(folder)
     assert "(2, 16 or 17, height, width)" in str(caught.value)
 
@@ -278,7 +279,7 @@ def test_what_the_layout_has_no_place_for_is_refused(rig: Capture, tmp_path: Pat
         "a lens": replace(rig, camera=replace(rig.camera, cx_px=3.0)),
     }
     for what, capture in cases.items():
-        with pytest.raises(CaptureError, match=f"no place for {what}"):
+        with pytest.raises(CaptureError, match=f"cannot store {what}"):
             write_evdnerf.write(capture, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -83,7 +83,7 @@ def test_images_along_the_path_are_on_it(folder: Path) -> None:
 
 
 def test_the_unit_is_never_guessed(folder: Path) -> None:
-    with pytest.raises(CaptureError, match="do not say the unit") as caught:
+    with pytest.raises(CaptureError, match="do not state the unit") as caught:
         read_capture(folder)
     assert "--event-unit" in str(caught.value)
 

@@ -88,8 +88,8 @@ def test_bounds_are_guessed_from_what_the_cameras_look_at(tmp_path):
 def test_parallel_cameras_look_at_no_point():
     poses = np.tile(np.eye(3, 4), (5, 1, 1))
     poses[:, 0, 3] = np.arange(5)
-    assert nerfstudio.guessed_bounds(poses) == pytest.approx((2.0, 200.0))
-    assert nerfstudio.guessed_bounds(poses[:1]) == pytest.approx((1.0, 100.0))
+    assert nerfstudio.estimated_bounds(poses) == pytest.approx((2.0, 200.0))
+    assert nerfstudio.estimated_bounds(poses[:1]) == pytest.approx((1.0, 100.0))
 
 
 def test_points(tmp_path):

@@ -1,8 +1,8 @@
-"""Posed photographs: images whose poses are known, but not how the camera moved meanwhile.
+"""Posed photographs: images with one pose each; motion during the exposure is unknown.
 
 Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds.
-Whether such photos are blurred by motion, their exposures cannot tell: `Known.motion` is "unknown"
-then, and recipes with a learned blur kernel start from that.
+Exposures do not tell whether such photos are blurred by motion: `Known.motion` is "unknown", which
+makes recipes learn a blur kernel.
 """
 
 import re
@@ -24,11 +24,11 @@ from sharpfield.storage.images import list_images
 SECOND_US = 1_000_000
 
 HOLD_OUT = "every:8"
-"""LLFF's rule of what to hold out, see `captures.hold_out`."""
+"""The hold-out rule of LLFF, see `captures.hold_out`."""
 
 
 PHOTOS = Known(motion="unknown")
-"""Of photos, each with one pose: they may be sharp or blurred."""
+"""Knowledge about photos with one pose each: they may be sharp or blurred."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Photos:
     """World-from-camera, OpenCV axes."""
     names: Sequence[str]
     camera: Camera
-    """May be given for another size; it is fitted to the images."""
+    """It may be for another image size; it is scaled to the images."""
     encoding: str = "srgb"
     """How stored values relate to light, see `Frames`."""
 
@@ -61,12 +61,12 @@ def photo_capture(
 
     Args:
         photos: The images.
-        split: Which are learned from.
+        split: Training and held-out photos.
         bounds: Nearest and farthest depth of the scene.
         name: Name of the scene.
         source: The layout it was read from.
         points: Sparse scene points.
-        known: What is known; by default all but the motion of the camera.
+        known: What is known; by default everything but the motion of the camera.
         notes: Remarks for people.
     """
     count, height, width, _ = photos.images.shape
@@ -79,7 +79,7 @@ def photo_capture(
         encoding=photos.encoding,
     )
     return Capture(
-        camera=fitted(photos.camera, width, height, where=name),
+        camera=scaled_camera(photos.camera, width, height, where=name),
         trajectory=Still(photos.poses),
         clock=Clock(0, max(count - 1, 1) * SECOND_US),
         near=bounds[0],
@@ -95,12 +95,12 @@ def photo_capture(
 
 
 def choose_images(folder: Path, factor: int | None) -> Path:
-    """The folder of images to read: `images_<factor>`, or the smallest that are there.
+    """The folder of images to read: `images_<factor>`, by default with the largest factor.
 
-    `images` stands for a factor of 1 where there is no `images_1`.
+    `images` has a factor of 1 where there is no `images_1`.
 
     Raises:
-        CaptureError: There is none, or not this one.
+        CaptureError: There are no images, or none of this factor.
     """
     found = {
         int(match[1] or 1): path
@@ -120,14 +120,14 @@ def choose_images(folder: Path, factor: int | None) -> Path:
 def existing(
     paths: Sequence[Path], *, missing: Missing | None, where: object
 ) -> Int64[np.ndarray, "m"]:
-    """Indices of the files that are there.
+    """Indices of the files that exist.
 
     Raises:
-        CaptureError: Some are not and `missing` is not "skip", or none is there.
+        CaptureError: Some do not exist and `missing` is not "skip", or none exists.
     """
-    there = np.array([path.is_file() for path in paths], bool)
-    gone = np.flatnonzero(~there)
-    if len(gone) and (missing != "skip" or not there.any()):
+    found = np.array([path.is_file() for path in paths], bool)
+    gone = np.flatnonzero(~found)
+    if len(gone) and (missing != "skip" or not found.any()):
         named = ", ".join(paths[i].name for i in gone[:3])
         raise CaptureError(
             f"{len(gone)} of {len(paths)} images are missing",
@@ -135,20 +135,20 @@ def existing(
             got=f"no {named}{', ...' if len(gone) > 3 else ''} in {paths[gone[0]].parent}",
             do="complete the download, or set the option `missing` to skip",
         )
-    return np.flatnonzero(there)
+    return np.flatnonzero(found)
 
 
-def fitted(camera: Camera, width: int, height: int, *, where: object) -> Camera:
-    """The camera of images that were scaled to another size.
+def scaled_camera(camera: Camera, width: int, height: int, *, where: object) -> Camera:
+    """The camera scaled to images of another size.
 
     Raises:
-        CaptureError: The shape is another: the images were cropped, or are not this camera's.
+        CaptureError: The aspect ratio differs: the images were cropped, or are of another camera.
     """
     sx, sy = width / camera.width, height / camera.height
     # Each side may have been rounded to whole pixels, up or down.
     if abs(sx - sy) > max(1 / camera.width, 1 / camera.height):
         raise CaptureError(
-            "images and intrinsics have different shapes",
+            "images and intrinsics have different aspect ratios",
             where=where,
             got=f"images {width}x{height}, intrinsics for {camera.width}x{camera.height}",
             do="give intrinsics for these images; cropping moves the principal point",
@@ -168,7 +168,7 @@ def same_camera(cameras: Sequence[Camera], names: Sequence[str], *, where: objec
     """The camera that all photos share.
 
     Raises:
-        CaptureError: They do not share one.
+        CaptureError: Two photos have different cameras.
     """
     for camera, name in zip(cameras, names, strict=True):
         if not _agree(camera, cameras[0]):
@@ -176,7 +176,7 @@ def same_camera(cameras: Sequence[Camera], names: Sequence[str], *, where: objec
                 "all photos of a capture must share one camera",
                 where=f"{where}, {names[0]} and {name}",
                 got=f"{cameras[0]} and {camera}",
-                do="undistort the photos to one camera, or keep those of one camera",
+                do="undistort the photos to one camera, or use those of one camera only",
             )
     return cameras[0]
 
@@ -188,29 +188,30 @@ def depth_bounds(
     *,
     where: object,
 ) -> tuple[float, float]:
-    """Near and far of a scene: the 0.1th and 99.9th percentile of depth, the extreme cameras'.
+    """Near and far: smallest 0.1th and largest 99.9th percentile of depth over the cameras.
 
     Args:
         points: Sparse scene points.
         poses: World-from-camera.
-        seen: Which camera (row of `poses`) saw which point (row of `points`).
-        where: The scene, for the message.
+        seen: Observations: the camera (row of `poses`) and the point (row of `points`).
+        where: The scene, for error messages.
 
     Raises:
-        CaptureError: No camera saw a point before it.
+        CaptureError: No observed point lies in front of its camera.
 
     Source: LLFF's `imgs2poses`.
     """
     camera, point = seen[np.argsort(seen[:, 0], kind="stable")].T
+    # Depth along the optical axis of the observing camera.  [o]
     depth = ((points[point] - poses[camera, :, 3]) * poses[camera, :, 2]).sum(-1)
     camera, depth = camera[depth > 0], depth[depth > 0]
     each = np.split(depth, np.flatnonzero(np.diff(camera)) + 1)
     limits = [np.percentile(one, [0.1, 99.9]) for one in each if len(one)]
     if not limits:
         raise CaptureError(
-            "no scene point lies before a camera that saw it, so depth bounds are unknown",
+            "no scene point lies in front of a camera that observed it: depth bounds are unknown",
             where=where,
-            do="give near and far",
+            do="give the option `bounds`: near and far",
         )
     return float(np.min(limits)), float(np.max(limits))
 

@@ -1,4 +1,4 @@
-"""`poses_bounds.npy`: the pose table of LLFF, used by Deblur-NeRF and Ev-DeblurNeRF scenes.
+"""`poses_bounds.npy`: the pose table of LLFF, also of Deblur-NeRF and Ev-DeblurNeRF scenes.
 
 Each row has 17 numbers: a 3x5 matrix in row-major order, `[R | t | (height, width, focal)]`, then
 the nearest and farthest depth seen by that camera. The columns of R are the camera's down, right
@@ -27,9 +27,9 @@ class PosesBounds:
     width: float
     height: float
     focal_px: float
-    """For images of `width` x `height`, which need not be the size of those at hand."""
+    """For images of `width` x `height`, which may differ from the size of the images at hand."""
     bounds: Float64[np.ndarray, "n 2"]
-    """Nearest and farthest depth in view of each camera."""
+    """Nearest and farthest depth seen by each camera."""
 
     def __len__(self) -> int:
         """Number of poses."""
@@ -40,22 +40,25 @@ def read_poses_bounds(path: Path) -> PosesBounds:
     """Read and check a pose table.
 
     Raises:
-        CaptureError: The file is missing or malformed, holds non-finite numbers, a rotation that
-            is not one, cameras that differ, or impossible depth bounds.
+        CaptureError: The file is missing or malformed, or holds non-finite numbers, invalid
+            rotations, different cameras, or impossible depth bounds.
     """
     rows = load_array(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows):
         raise CaptureError(
-            "a pose table must have 17 columns", where=path, got=f"shape {rows.shape}"
+            "a pose table must have 17 columns",
+            where=path,
+            got=f"shape {rows.shape}",
+            do="write the table of LLFF's imgs2poses: 3x5 matrix, near, far",
         )
     rows = rows.astype(np.float64)
-    matrix = rows[:, :15].reshape(-1, 3, 5)
+    matrix = rows[:, :15].reshape(-1, 3, 5)  # [n, 3, 5]
     down, right, backward, centre, intrinsics = np.moveaxis(matrix, -1, 0)
-    poses = np.stack([right, down, -backward, centre], -1)
+    poses = np.stack([right, down, -backward, centre], -1)  # [n, 3, 4]
     check_poses(poses, path)
     if np.ptp(intrinsics, 0).max() > 1e-3 * np.abs(intrinsics).max():
         raise CaptureError(
-            "the cameras of a scene must agree in size and focal length",
+            "the cameras of a scene must have one size and focal length",
             where=f"{path}, columns 5, 10 and 15",
             got=f"focal lengths from {intrinsics[:, 2].min():g} to {intrinsics[:, 2].max():g}",
         )

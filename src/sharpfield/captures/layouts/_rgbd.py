@@ -1,8 +1,8 @@
-"""Recordings of depth cameras: colour, depth and a pose for each frame, in files of many layouts.
+"""Recordings of depth cameras: colour, depth and a pose for each frame; common to all layouts.
 
-A layout's reader says where things are (`RgbdFrames`); what is common happens here. Frames without
-a usable pose are left out, and `notes["dropped"]` says so. As for all photos with one pose each
-(`captures.photos`), every frame is an instant on a still track of its own.
+The reader of a layout locates the files (`RgbdFrames`). Frames without a usable pose are left out,
+and `notes["dropped"]` lists them. As for all photos with one pose each (`layouts._photos`), every
+frame is an instant on a still track of its own.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,42 +23,41 @@ from sharpfield.storage.images import image_stack
 BOUNDS = (0.1, 8.0)
 """Nearest and farthest depth of rooms, in metres."""
 SIZE = (640, 480)
-"""Larger images are brought to this size; upright ones to the same, turned."""
-SAME_SHAPE = 0.02
-"""Images of about the same shape are brought to that size exactly, as published; others keep
-their own shape."""
+"""Maximum size of images, in landscape orientation; larger ones are downscaled."""
+SAME_ASPECT = 0.02
+"""Images whose aspect ratio differs by less are scaled to exactly that size, as published; others
+keep their aspect ratio."""
 OFF_CENTRE = 0.25
-"""Intrinsics whose principal point is farther from the middle, over the size, are not the image's.
-"""
+"""Maximum distance of the principal point from the image centre, relative to the image size."""
 FARTHEST_POSE = 30.0
-"""Poses with a larger entry are failures of tracking, not places in a room."""
-NAMED = 6
-"""Dropped frames that are named."""
+"""Poses with a larger entry (metres) are tracking failures."""
+LISTED = 6
+"""Number of dropped frames that are listed by name."""
 
 Row = int
-"""Number of a frame in its recording."""
+"""Index of a frame in its recording."""
 
 
 @dataclass(frozen=True)
 class RgbdFrames:
-    """Where the frames of a recording are, before any is decoded."""
+    """The frames of a recording, before any is decoded."""
 
     names: Sequence[str]
     poses: Float64[np.ndarray, "n 3 4"]
     """World-from-camera, OpenCV axes; not finite where tracking failed."""
     colour: Callable[[Row], UInt8[np.ndarray, "h w 3"]]
-    """Decodes the image of a frame."""
+    """Decodes the colour image of a frame."""
     depth: Callable[[Row], UInt16[np.ndarray, "y x"]] | None
     """Decodes the depth of a frame, in mm, 0 where unknown."""
     measured: Bool[np.ndarray, "n"]
-    """Which frames have depth; where there is none, it is unknown everywhere."""
+    """Which frames have a depth map; without one, depth is unknown in all pixels."""
     camera: Camera
     """Of the colour images as stored."""
     depth_camera: Camera
     sources: Sequence[Path]
-    """The files that colour comes from."""
+    """The files of the colour images."""
     depth_sources: Sequence[Path]
-    """The files that depth comes from."""
+    """The files of the depth maps."""
 
 
 def rgbd_capture(
@@ -69,14 +68,14 @@ def rgbd_capture(
     source: str,
     points: Float64[np.ndarray, "m 3"] | None = None,
 ) -> Capture:
-    """A capture of a depth camera's recording.
+    """A capture from a recording of a depth camera.
 
     Args:
-        frames: Where its frames are.
-        split: What to hold out of so many frames; poses that failed do not count.
-        folder: Of the recording; names it.
+        frames: The frames.
+        split: The split for a number of frames, without those whose pose is unusable.
+        folder: Of the recording, which is named after it.
         source: The layout.
-        points: Scene points that came with it.
+        points: Sparse scene points.
 
     Raises:
         CaptureError: No frame has a pose, or an image cannot be read.
@@ -84,8 +83,13 @@ def rgbd_capture(
     usable = usable_poses(frames.poses)
     kept = np.flatnonzero(usable)
     if not len(kept):
-        raise CaptureError("no frame has a usable pose", where=folder, got=f"{len(usable)} frames")
-    camera = resized(frames.camera, SIZE)
+        raise CaptureError(
+            "no frame has a usable pose",
+            where=folder,
+            got=f"{len(usable)} frames",
+            do=f"poses must be finite, with entries below {FARTHEST_POSE:g} m",
+        )
+    camera = downscaled_camera(frames.camera, SIZE)
     images = image_stack(
         kept.tolist(),
         lambda row: _sized(frames.colour(row), camera.size),
@@ -115,18 +119,18 @@ def rgbd_capture(
 
 
 def usable_poses(poses: Float64[np.ndarray, "n 3 4"]) -> Bool[np.ndarray, "n"]:
-    """Which poses are finite and within a room."""
+    """Which poses are finite and not farther away than `FARTHEST_POSE`."""
     largest = np.abs(poses).reshape(len(poses), -1).max(1)
     return np.isfinite(largest) & (largest < FARTHEST_POSE)
 
 
-def resized(camera: Camera, most: tuple[int, int]) -> Camera:
-    """A camera whose images are brought to a size if they are larger, see `SAME_SHAPE`."""
-    wide, high = most if camera.width >= camera.height else most[::-1]
+def downscaled_camera(camera: Camera, largest: tuple[int, int]) -> Camera:
+    """The camera of images that are downscaled if larger than a size, see `SAME_ASPECT`."""
+    wide, high = largest if camera.width >= camera.height else largest[::-1]
     if camera.width <= wide and camera.height <= high:
         return camera
     sx, sy = wide / camera.width, high / camera.height
-    if abs(sx / sy - 1) > SAME_SHAPE:
+    if abs(sx / sy - 1) > SAME_ASPECT:
         wide, high = (max(round(side * min(sx, sy)), 1) for side in camera.size)
         sx, sy = wide / camera.width, high / camera.height
     return replace(
@@ -141,31 +145,36 @@ def resized(camera: Camera, most: tuple[int, int]) -> Camera:
 
 
 def pinhole(matrix: Shaped[np.ndarray, "r c"], size: tuple[int, int], *, where: object) -> Camera:
-    """A camera of an intrinsic matrix, 3x3 or larger, for pixel centres at +0.5.
+    """A pinhole camera from an intrinsic matrix, 3x3 or larger, for pixel centres at +0.5.
 
     Raises:
-        CaptureError: It is no such matrix, or one for images of another size.
+        CaptureError: It is not such a matrix, or it is for images of another size.
     """
     if matrix.ndim != 2 or min(matrix.shape) < 3 or not np.isfinite(matrix[:3, :3]).all():
-        raise CaptureError("cannot read the intrinsics", where=where, got=f"{matrix.shape} numbers")
+        raise CaptureError(
+            "intrinsics must be a finite matrix of 3x3 or more",
+            where=where,
+            got=f"shape {matrix.shape}",
+            do="write fx 0 cx / 0 fy cy / 0 0 1",
+        )
     fx, fy, cx, cy = (float(matrix[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     off = max(abs(cx / size[0] - 0.5), abs(cy / size[1] - 0.5))
     if off > OFF_CENTRE or not min(fx, fy) > 0:
         raise CaptureError(
-            "the intrinsics are not those of the images",
+            "the intrinsics do not belong to the images",
             where=where,
             got=f"focal lengths {fx:.4g}, {fy:.4g}, principal point {cx:.4g}, {cy:.4g} px;"
             f" images of {size[0]}x{size[1]}",
-            do="give intrinsics for images of this size, or the images that they are for",
+            do="give intrinsics for images of this size",
         )
     return Camera(*size, fx, fy, cx, cy)
 
 
 def read_matrix(path: Path) -> Shaped[np.ndarray, "r c"]:
-    """The numbers of a text, a row each line; `inf` and `nan` are numbers, too.
+    """Read a text of numbers, a row per line; `inf` and `nan` are allowed.
 
     Raises:
-        CaptureError: It is missing, or no table of numbers.
+        CaptureError: The file is missing, or is not a table of numbers.
     """
     try:
         return np.loadtxt(path, ndmin=2)
@@ -176,10 +185,10 @@ def read_matrix(path: Path) -> Shaped[np.ndarray, "r c"]:
 
 
 def read_pose(path: Path) -> Float64[np.ndarray, "3 4"]:
-    """World-from-camera, from a text with a 3x4 or 4x4 matrix.
+    """Read a world-from-camera pose from a text with a 3x4 or 4x4 matrix.
 
     Raises:
-        CaptureError: It is missing, or has another shape.
+        CaptureError: The file is missing, or the matrix has another shape.
     """
     matrix = read_matrix(path)
     if matrix.shape not in ((3, 4), (4, 4)):
@@ -208,18 +217,18 @@ def _depth_maps(
 
 
 def _notes(frames: RgbdFrames, usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:
-    """Which frames were left out, and which have no depth."""
+    """Which frames were left out, and which have no depth map."""
     notes: dict[str, float | str] = {}
     if not usable.all():
-        notes["dropped"] = _named(frames, ~usable, "have no usable pose")
+        notes["dropped"] = _listed(frames, ~usable, "have no usable pose")
     if frames.depth is not None and not frames.measured[usable].all():
-        notes["without_depth"] = _named(frames, usable & ~frames.measured, "have no depth")
+        notes["without_depth"] = _listed(frames, usable & ~frames.measured, "have no depth")
     return notes
 
 
-def _named(frames: RgbdFrames, which: Bool[np.ndarray, "n"], what: str) -> str:
+def _listed(frames: RgbdFrames, which: Bool[np.ndarray, "n"], what: str) -> str:
     rows = np.flatnonzero(which).tolist()
-    named = ", ".join(frames.names[i] for i in rows[:NAMED]) + (
-        ", ..." if len(rows) > NAMED else ""
+    named = ", ".join(frames.names[i] for i in rows[:LISTED]) + (
+        ", ..." if len(rows) > LISTED else ""
     )
     return f"{len(rows)} of {len(which)} frames {what}: {named}"

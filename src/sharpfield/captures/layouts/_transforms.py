@@ -63,11 +63,13 @@ def frames_of(content: dict[str, Any], where: object) -> list[dict[str, Any]]:
     """
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise CaptureError("there are no frames", where=f"{where}, key `frames`")
+        raise CaptureError("there are no frames", where=f"{where}, key `frames`", do="list them")
     for i, frame in enumerate(frames):
         for key, kind in (("file_path", str), ("transform_matrix", list)):
             if not isinstance(frame, dict) or not isinstance(frame.get(key), kind):
-                raise CaptureError(f"a frame lacks `{key}`", where=f"{where}, frame {i}")
+                raise CaptureError(
+                    f"a frame lacks `{key}`", where=f"{where}, frame {i}", do="add it"
+                )
     return frames
 
 
@@ -205,7 +207,9 @@ def train_and_held_out(
     """
     files = [folder / f"transforms_{name}.json" for name in SETS]
     if not files[0].is_file():
-        raise CaptureError("there is no transforms_train.json", where=folder)
+        raise CaptureError(
+            "there is no transforms_train.json", where=folder, do="complete the download"
+        )
     found = [path for path in files if path.is_file()][:2]
     sets = [read_views(path, timed=timed).existing(missing, path) for path in found]
     expect_one_camera(sets, folder)

@@ -5,12 +5,12 @@
     lowres_wide_intrinsics/VIDEO_TIME.pincam    `width height fx fy cx cy` of each frame
     lowres_wide.traj                            `time rx ry rz tx ty tz` in s, rad, m
 
-Names of the three may differ by a millisecond, and depth may have been taken less often: an image
-keeps the depth of the same time, or has none. A line of the trajectory is camera from world: a turn
-about an axis, then a shift. It has ten poses a second and images sixty, so poses in between are
-interpolated, and images before the first or after the last are left out. The lens refocuses; a
-capture has one camera, so the median of all intrinsics stands for it, and `notes["focal_spread"]`
-says how far they stray.
+The times in the three names may differ by a millisecond, and depth may have been recorded less
+often: an image has the depth map of the same time, or none. A line of the trajectory is
+camera-from-world: rotation vector, then translation. It has ten poses a second and images sixty, so
+poses are interpolated, and images before the first or after the last pose are left out. The lens
+refocuses; a capture has one camera, so its intrinsics are the median of all, and
+`notes["focal_spread"]` is the relative spread of the focal length.
 
 Source: Baruch et al., *ARKitScenes* (NeurIPS 2021 datasets track), its data description.
 """
@@ -38,11 +38,11 @@ WIDE, DEPTH, INTRINSICS = "lowres_wide", "lowres_depth", "lowres_wide_intrinsics
 TRAJECTORY = "lowres_wide.traj"
 COLUMNS = 7
 SAME_S = 0.005
-"""Depth taken so shortly before or after an image is of the same time."""
+"""Depth maps closer in time to an image belong to it, in seconds."""
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder holds such a recording."""
+    """Whether a folder has this layout."""
     return (folder / WIDE).is_dir() and (folder / TRAJECTORY).is_file()
 
 
@@ -54,15 +54,21 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         options: `hold_out`.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     colour = sorted((folder / WIDE).glob("*.png"), key=_seconds)
     if not colour:
-        raise CaptureError(f"there are no images in {WIDE}/", where=folder)
+        raise CaptureError(
+            f"there are no images in {WIDE}/", where=folder, do="it must hold VIDEO_TIME.png"
+        )
     camera, spread = _camera(folder)
     maps, measured = _depth_of(colour, list((folder / DEPTH).glob("*.png")))
     if not measured.any():
-        raise CaptureError(f"no image of {WIDE}/ has depth in {DEPTH}/", where=folder)
+        raise CaptureError(
+            f"no image of {WIDE}/ has depth in {DEPTH}/",
+            where=folder,
+            do="names must end in the same time",
+        )
     frames = RgbdFrames(
         names=[path.stem for path in colour],
         poses=_poses(folder / TRAJECTORY, [_seconds(path) for path in colour]),
@@ -72,7 +78,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         camera=camera,
         depth_camera=camera,
         sources=colour,
-        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
+        depth_sources=[path for path, known in zip(maps, measured, strict=True) if known],
     )
     made = rgbd_capture(
         frames,
@@ -96,7 +102,7 @@ def _seconds(path: Path) -> float:
 def _depth_of(
     colour: Sequence[Path], depth: Sequence[Path]
 ) -> tuple[list[Path], Bool[np.ndarray, "n"]]:
-    """The depth map next in time to each image, and whether it is of the same time."""
+    """The depth map nearest in time to each image, and whether its time is the same."""
     if not depth:
         return list(colour), np.zeros(len(colour), bool)
     ordered = sorted(depth, key=_seconds)
@@ -109,11 +115,13 @@ def _depth_of(
 
 
 def _camera(folder: Path) -> tuple[Camera, float]:
-    """The camera of all frames, and how far the focal length strays, as a share."""
+    """The median camera of all frames, and the relative spread of the focal length."""
     rows = [_pincam(path) for path in sorted((folder / INTRINSICS).glob("*.pincam"))]
     table = np.stack(rows or [np.zeros(6)])
     if not table[:, 2].all():
-        raise CaptureError("no image has intrinsics", where=folder / INTRINSICS)
+        raise CaptureError(
+            "no image has intrinsics", where=folder / INTRINSICS, do="add the .pincam files"
+        )
     width, height, fx, fy, cx, cy = np.median(table, axis=0).tolist()
     return Camera(int(width), int(height), fx, fy, cx, cy), float(np.ptp(table[:, 2]) / fx)
 
@@ -121,30 +129,40 @@ def _camera(folder: Path) -> tuple[Camera, float]:
 def _pincam(path: Path) -> Shaped[np.ndarray, "6"]:
     row = read_matrix(path).ravel()
     if len(row) != 6:
-        raise CaptureError("intrinsics must be six numbers", where=path, got=len(row))
+        raise CaptureError(
+            "intrinsics must be six numbers",
+            where=path,
+            got=len(row),
+            do="write width height fx fy cx cy",
+        )
     return row
 
 
 def _poses(path: Path, times_s: Sequence[float]) -> Float64[np.ndarray, "n 3 4"]:
-    """Poses at the times of images; not a number outside of the trajectory."""
+    """Poses at the times of images; NaN outside of the trajectory."""
     rows = read_matrix(path)
     if rows.shape[1] != COLUMNS or len(rows) < 2:
         raise CaptureError(
-            "a trajectory must have two lines or more of seven numbers", where=path, got=rows.shape
+            "a trajectory must have at least two lines of seven numbers",
+            where=path,
+            got=rows.shape,
+            do="write time rx ry rz tx ty tz per line",
         )
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    turn = se3.rotation_exp(torch.from_numpy(rows[:, 1:4])).numpy()
-    shift = rows[:, 4:, None]
-    poses = np.concatenate([turn.transpose(0, 2, 1), -turn.transpose(0, 2, 1) @ shift], -1)
+    rotation = se3.rotation_exp(torch.from_numpy(rows[:, 1:4])).numpy()  # camera from world
+    inverse = rotation.transpose(0, 2, 1)
+    poses = np.concatenate([inverse, -inverse @ rows[:, 4:, None]], -1)  # [p, 3, 4]
     known_us = np.rint(1e6 * (rows[:, 0] - rows[0, 0])).astype(np.int64)
-    fresh = np.flatnonzero(np.diff(known_us, prepend=-1) > 0)
+    distinct = np.flatnonzero(np.diff(known_us, prepend=-1) > 0)
     clock = Clock(0, max(int(known_us[-1]), 1))
-    way = Stamped(known_us[fresh], np.ascontiguousarray(poses[fresh]), clock, "linear")
+    trajectory = Stamped(known_us[distinct], np.ascontiguousarray(poses[distinct]), clock, "linear")
     asked = np.rint(1e6 * (np.asarray(times_s) - rows[0, 0])).astype(np.int64)
     inside = (asked >= 0) & (asked <= known_us[-1])
     found = np.full((len(asked), 3, 4), np.nan)
     unit = torch.from_numpy(clock.unit(asked[inside]))
-    found[inside] = way.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).double().numpy()
+    found[inside] = (
+        trajectory.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).double().numpy()
+    )
     return found
 
 

@@ -2,7 +2,7 @@
 
     images/ or images_N/    photos; images_N are N times smaller
     sparse/0/               cameras, images and points3D, .bin or .txt;
-                            sparse/ and colmap/sparse/0/ are found, too
+                            or in sparse/ or colmap/sparse/0/
 
 Intrinsics are scaled to the size of the images that are read. Depth bounds come from the points.
 """
@@ -27,7 +27,7 @@ from sharpfield.storage.images import SUFFIXES, read_images
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder holds a COLMAP model and images, and no other layout's table of poses."""
+    """Whether a folder holds a COLMAP model and images, and no pose table of another layout."""
     return (
         find_model(folder) is not None
         and any(folder.glob("images*/"))
@@ -45,25 +45,26 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             by default what the points show; `missing` photos of the model.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
-    place = find_model(folder)
-    if place is None:
+    model_folder = find_model(folder)
+    if model_folder is None:
         raise CaptureError("no COLMAP model", where=folder, do="put one in sparse/0")
-    model = read_model(place)
+    model = read_model(model_folder)
     paths = _image_paths(choose_images(folder, options.factor), model)
-    kept = existing(paths, missing=options.missing, where=place)
+    kept = existing(paths, missing=options.missing, where=model_folder)
     names = [model.names[i] for i in kept]
     photos = Photos(
         images=read_images([paths[i] for i in kept]),
         poses=model.poses[kept],
         names=[Path(name).with_suffix("").as_posix() for name in names],
-        camera=same_camera([model.cameras[i] for i in kept], names, where=place),
+        camera=same_camera([model.cameras[i] for i in kept], names, where=model_folder),
     )
     return photo_capture(
         photos,
         split_by_rule(len(kept), options.hold_out or HOLD_OUT),
-        bounds=options.bounds or depth_bounds(model.points, model.poses, model.seen, where=place),
+        bounds=options.bounds
+        or depth_bounds(model.points, model.poses, model.seen, where=model_folder),
         name=folder.resolve().name,
         source="colmap",
         points=model.points if len(model.points) else None,
@@ -71,7 +72,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
 
 
 def _image_paths(folder: Path, model: Model) -> list[Path]:
-    """Where each photo is; smaller copies may have another suffix than the name says."""
+    """The path of each photo; downscaled copies may have another suffix than the model states."""
     return [_with_any_suffix(folder / name) for name in model.names]
 
 

@@ -24,8 +24,8 @@ from sharpfield.geometry import se3
 
 INTRINSICS = ("f", "fx", "fy", "cx", "cy")
 
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "")
-"""Where in a scene's folder a model may be."""
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "")
+"""Subfolders of a scene that may hold a model."""
 
 OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 TRACK = np.dtype([("image", "<u4"), ("observation", "<u4")])
@@ -42,7 +42,7 @@ class Model:
     """One for each image."""
     points: Float64[np.ndarray, "m 3"]
     seen: Int64[np.ndarray, "o 2"]
-    """Which image (row) saw which point (row)."""
+    """Observations: image (row) and point (row)."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +58,16 @@ class _Image:
 class _Points:
     xyz: Float64[np.ndarray, "m 3"]
     image: Int64[np.ndarray, "o"]
-    """COLMAP's number of each image that saw a point, point after point."""
+    """COLMAP's number of the image of each observation, ordered by point."""
     row: Int64[np.ndarray, "o"]
-    """The point's row."""
+    """The row of the point of each observation."""
 
 
 def find_model(folder: Path) -> Path | None:
-    """Where below a scene's folder a model is, or None."""
-    for place in PLACES:
-        if any((folder / place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-            return folder / place
+    """The folder of the model of a scene, or None."""
+    for name in FOLDERS:
+        if any((folder / name / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder / name
     return None
 
 
@@ -86,14 +86,17 @@ def read_model(folder: Path) -> Model:
     images = (_binary_images if binary else _text_images)(images_path)
     points = (_binary_points if binary else _text_points)(points_path)
     if not images:
-        raise CaptureError("the reconstruction holds no images", where=images_path)
+        raise CaptureError(
+            "the reconstruction holds no images", where=images_path, do="register some with COLMAP"
+        )
     images = sorted(images, key=lambda image: image.name)
     for image in images:
         if image.camera not in cameras:
             raise CaptureError(
-                "an image names a camera that does not exist",
+                "an image refers to a camera that does not exist",
                 where=f"{images_path}, {image.name}",
                 got=f"camera {image.camera} of {sorted(cameras)}",
+                do="export the model again",
             )
     row_of = {image.number: row for row, image in enumerate(images)}
     rows = np.array([row_of.get(int(number), -1) for number in points.image], np.int64)
@@ -110,7 +113,11 @@ def read_model(folder: Path) -> Model:
 def camera_of(
     model: str, width: int, height: int, parameters: tuple[float, ...], *, where: object
 ) -> Camera:
-    """Our camera for COLMAP's model name and parameters."""
+    """The camera for a model name and parameters of COLMAP.
+
+    Raises:
+        CaptureError: The model is not supported.
+    """
     known, given = colmap_models(), {}
     if model in known and len(parameters) == len(known[model][0].parameters):
         given = dict(zip(known[model][0].parameters, parameters, strict=True))
@@ -146,40 +153,40 @@ def _world_from_camera(images: list[_Image]) -> Float64[np.ndarray, "n 3 4"]:
 
 
 class _Bytes:
-    """Reads a binary file from its start, and says so if it ends too early."""
+    """Reads a binary file from its start; a truncated file is an error."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, _found(path).read_bytes(), 0
+        self.path, self.data, self.position = path, _found(path).read_bytes(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
         """Little-endian numbers, as in `struct`."""
         size = struct.calcsize("<" + layout)
         self._need(size)
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += size
+        values = struct.unpack_from("<" + layout, self.data, self.position)
+        self.position += size
         return values
 
     def array(self, dtype: np.dtype, count: int) -> np.ndarray:
         """`count` records."""
         self._need(count * dtype.itemsize)
-        values = np.frombuffer(self.data, dtype, count, self.at)
-        self.at += count * dtype.itemsize
+        values = np.frombuffer(self.data, dtype, count, self.position)
+        self.position += count * dtype.itemsize
         return values
 
     def text(self) -> str:
         """Characters up to a zero byte."""
-        end = self.data.find(b"\0", self.at)
-        self._need(end - self.at + 1 if end >= 0 else len(self.data) + 1)
-        value = self.data[self.at : end].decode("utf-8", "replace")
-        self.at = end + 1
+        end = self.data.find(b"\0", self.position)
+        self._need(end - self.position + 1 if end >= 0 else len(self.data) + 1)
+        value = self.data[self.position : end].decode("utf-8", "replace")
+        self.position = end + 1
         return value
 
     def _need(self, size: int) -> None:
-        if self.at + size > len(self.data):
+        if self.position + size > len(self.data):
             raise CaptureError(
                 "COLMAP file is truncated",
                 where=self.path,
-                got=f"{len(self.data)} bytes; more are needed after byte {self.at}",
+                got=f"{len(self.data)} bytes; more are needed after byte {self.position}",
                 do="copy it again",
             )
 
@@ -245,7 +252,7 @@ def _text_points(path: Path) -> _Points:
 
 
 def _points(xyz: list[list[float]], tracks: list[np.ndarray]) -> _Points:
-    """Points, and the images that saw each."""
+    """Points, and the images of their observations."""
     lengths = [len(track) for track in tracks]
     return _Points(
         xyz=np.array(xyz, np.float64).reshape(-1, 3),

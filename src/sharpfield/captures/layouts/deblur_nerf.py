@@ -3,7 +3,7 @@
     images/ or images_N/    photos, sorted by name; images_N are N times smaller
     poses_bounds.npy        one row per photo
     hold=K                  optional marker: every K-th photo is held out (sharp in Deblur-NeRF)
-    sparse/0/               optional COLMAP model the poses came from
+    sparse/0/               optional COLMAP model from which the poses came
 
 Source: Ma et al., *Deblur-NeRF* (CVPR 2022) and its released scenes; Mildenhall et al., *Local
 Light Field Fusion* (SIGGRAPH 2019).
@@ -25,12 +25,12 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import list_images, read_images
 
-SAME_PLACE = 0.01
-"""Two reconstructions are the same if no camera differs by more than this, in nearest depths."""
+SAME_POSITION = 0.01
+"""Two reconstructions are the same if no camera position differs by more, relative to near."""
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder looks like such a scene: a pose table and images, but no events."""
+    """Whether a folder has this layout: a pose table and images, but no events."""
     return (
         (folder / "poses_bounds.npy").is_file()
         and any(folder.glob("images*/"))
@@ -47,7 +47,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             papers train on; `hold_out`, by default as the marker file says.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     images_folder = choose_images(folder, options.factor)
     table = read_poses_bounds(folder / "poses_bounds.npy")
@@ -57,6 +57,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             "there must be one pose for each image",
             where=folder,
             got=f"{len(paths)} images in {images_folder.name}, {len(table)} poses",
+            do="check for images that were added or removed afterwards",
         )
     width, height = round(table.width), round(table.height)
     photos = Photos(
@@ -82,7 +83,7 @@ def _hold_out(folder: Path) -> str:
     markers = [m for p in folder.glob("hold=*") if (m := re.fullmatch(r"hold=([1-9]\d*)", p.name))]
     if len(markers) > 1:
         raise CaptureError(
-            "there must be at most one marker of what is held out",
+            "there must be at most one marker file hold=K",
             where=folder,
             got=", ".join(sorted(m[0] for m in markers)),
             do="delete all but one",
@@ -92,14 +93,14 @@ def _hold_out(folder: Path) -> str:
 
 def _points(folder: Path, table: PosesBounds) -> Float64[np.ndarray, "m 3"] | None:
     """Points of the COLMAP model beside the table, if both describe the same reconstruction."""
-    place = find_model(folder)
-    if place is None:
+    model_folder = find_model(folder)
+    if model_folder is None:
         return None
-    model = read_model(place)
+    model = read_model(model_folder)
     if len(model.poses) != len(table):
         return None
-    apart = np.linalg.norm(model.poses[:, :, 3] - table.poses[:, :, 3], axis=-1).max()
-    return model.points if apart < SAME_PLACE * table.bounds.min() else None
+    distance = np.linalg.norm(model.poses[:, :, 3] - table.poses[:, :, 3], axis=-1).max()
+    return model.points if distance < SAME_POSITION * table.bounds.min() else None
 
 
 LAYOUT = Layout(

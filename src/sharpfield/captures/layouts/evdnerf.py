@@ -1,4 +1,4 @@
-"""EvDNeRF's data: event cameras that stand around a moving scene, all on one clock of one second.
+"""EvDNeRF's data: static event cameras around a moving scene, all on one clock of one second.
 
     transforms_train.json   `camera_angle_x`, `focal`?, frames with `time`; view after view, each
                             from time 0 to 1; ours also `threshold_on`, `threshold_off`
@@ -9,14 +9,11 @@
     train/rgba_00000.png    images, if there are any
 
 Each view is a still track; those of the validation set are held out, their events too. Streams are
-taken from `data_*.npz`, from pickled files if these are trusted, or else from the sums.
+read from `data_*.npz`, from pickled files if these are trusted, or else from the sums. A sum of n
+thresholds in a window becomes n events of its sign, evenly spread inside the window: in each window
+the stream is what the file states, and its times are known no finer than a window.
 
 Source: Bhattacharya et al., *EvDNeRF* (WACV 2024), and the files it published.
-
-Events that were summed over windows of time, made into a stream again.
-
-A sum of n thresholds in a window becomes n events of its sign, evenly spread inside the window: the
-stream reports in each window what the file says, and nothing finer than a window is to be believed.
 """
 
 from dataclasses import dataclass, replace
@@ -46,43 +43,43 @@ from sharpfield.storage.event_columns import coordinates, polarity, whole_us
 from sharpfield.storage.event_layouts import THRESHOLDS
 
 OFF_GRID = 0.05
-"""How far a sum may be from a whole number of thresholds, in thresholds."""
+"""Tolerance of sums: distance from a whole number of thresholds, in thresholds."""
 
 
-def unbinned(
+def events_from_sums(
     sums: Float[np.ndarray, "k h w"],
     edges_us: Int64[np.ndarray, "e"],
     *,
     threshold: float,
     where: object,
 ) -> EventStream:
-    """A stream that gives these sums.
+    """A stream of events with these sums.
 
     Args:
-        sums: Signed sum of thresholds in each window; natural log.
-        edges_us: Where windows begin, and where the last one ends; e = k + 1.
-        threshold: What one event stands for.
-        where: The file, for the message.
+        sums: Signed sum of thresholds in each window, natural log.
+        edges_us: Start of each window, and the end of the last one; e = k + 1.
+        threshold: Contribution of one event to a sum.
+        where: The file, for error messages.
 
     Raises:
         CaptureError: A sum is not finite, or not a whole number of thresholds.
     """
-    number = sums.astype(np.float64) / threshold
+    number = sums.astype(np.float64) / threshold  # [k, h, w]
     whole = np.rint(number)
     off = np.abs(number - whole)
-    if not (off < OFF_GRID).all():  # also where it is not a number
+    if not (off < OFF_GRID).all():  # also false for NaN
         i = np.unravel_index(int(np.nan_to_num(off, nan=np.inf).argmax()), sums.shape)
         raise CaptureError(
             "a sum of events is not a whole number of thresholds",
             where=f"{where}, window {i[0]}, row {i[1]}, column {i[2]}",
             got=f"{sums[i]:.6g}, threshold {threshold:.6g}",
-            do="give the contrast threshold that the events were weighed with",
+            do="give the option `threshold`: the factor of the events in the sums",
         )
     k, y, x = np.nonzero(whole)
     count = np.abs(whole[k, y, x]).astype(np.int64)
     event = np.repeat(np.arange(len(k)), count)
     rank = np.arange(len(event)) - np.repeat(np.cumsum(count) - count, count)
-    share = (rank + 0.5) / count[event]
+    share = (rank + 0.5) / count[event]  # position of an event in its window, 0...1
     t_us = edges_us[k[event]] + np.floor(share * np.diff(edges_us)[k[event]]).astype(np.int64)
     order = np.argsort(t_us, kind="stable")
     event = event[order]
@@ -97,23 +94,23 @@ def unbinned(
 
 
 def smallest_step(sums: Float[np.ndarray, "*n h w"]) -> float:
-    """The smallest sum that is not zero: one threshold, if any window holds a single event.
+    """The smallest nonzero sum: one threshold, if any window holds a single event.
 
     Raises:
-        CaptureError: All are zero.
+        CaptureError: All sums are zero.
     """
     size = np.abs(sums[sums != 0])
     if not len(size):
-        raise CaptureError("the windows hold no events", do="give the contrast threshold")
+        raise CaptureError("all sums of events are zero", do="give the option `threshold`")
     return float(f"{size.min():.6g}")  # 0.2 is stored as 0.200000003
 
 
 TEST_EVERY = 8
-"""Of the held-out frames every so many are for testing; all would take hours to render."""
+"""Every this many held-out frames are for testing; rendering all would take hours."""
 BOUNDS = (0.5, 1.5)
-"""Nearest and farthest depth, in distances of the cameras from the origin."""
+"""Near and far, relative to the mean distance of the cameras from the origin."""
 SAME_POSE = 1e-4
-"""How far the poses of one view may differ."""
+"""Tolerance of the poses of one view."""
 PICKLED = ("data_{}.npy", "data_{}.pkl")
 
 
@@ -128,12 +125,12 @@ class _Set:
 
     @property
     def poses(self) -> Float64[np.ndarray, "v 3 4"]:
-        """One for each view."""
+        """One pose for each view."""
         return self.views.poses.reshape(self.count, -1, 3, 4)[:, 0]
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder looks like such data."""
+    """Whether a folder has this layout."""
     files = ("data_frames_train.npy", "data_train.npz", "data_train.npy", "data_train.pkl")
     return (folder / "transforms_train.json").is_file() and any(
         (folder / file).is_file() for file in files
@@ -150,8 +147,8 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             what one event adds to the sums, where the smallest of them does not say.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together; or there is
-            nothing but pickled streams and they are not trusted.
+        CaptureError: Something is missing, malformed, or inconsistent; or there are only pickled
+            streams and they are not trusted.
     """
     sets = [
         _set(folder, name)
@@ -183,7 +180,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
 
 
 def _set(folder: Path, name: str) -> _Set:
-    """One set, its frames known to be of still views in the order of view and time."""
+    """One set, checked to hold static views in the order of view and time."""
     path = folder / f"transforms_{name}.json"
     views = read_views(path)
     count = int((np.abs(views.time - 1) < 1e-5).sum())
@@ -195,14 +192,18 @@ def _set(folder: Path, name: str) -> _Set:
         )
     time = views.time.reshape(count, -1)
     poses = views.poses.reshape(count, -1, 12)
-    moves = np.flatnonzero(np.abs(poses - poses[:, :1]).max((1, 2)) > SAME_POSE)
+    moving = np.flatnonzero(np.abs(poses - poses[:, :1]).max((1, 2)) > SAME_POSE)
     if (np.diff(time, axis=1) <= 0).any() or np.abs(time - time[0]).max() > 1e-5:
-        raise CaptureError("the views must have the same ascending times", where=path)
-    if len(moves):
         raise CaptureError(
-            "a view must stand still",
-            where=f"{path}, view {moves[0]}",
-            do="a camera that moves has another layout",
+            "the views must have the same ascending times",
+            where=path,
+            do="order frames by view, then by time",
+        )
+    if len(moving):
+        raise CaptureError(
+            "the camera of a view must not move",
+            where=f"{path}, view {moving[0]}",
+            do="write moving cameras in our own layout",
         )
     return _Set(name, views, count)
 
@@ -232,18 +233,18 @@ def _streams(
                 notes["raw_streams"] = f"{pickled[0].name} is pickled and was not read"
         elif pickled:
             raise CaptureError(
-                "the event streams are pickled: opening such a file may run what is in it",
+                "the event streams are pickled: opening such a file may run code that it contains",
                 where=pickled[0],
-                do="if you trust where it comes from, say so with --trust-pickle"
+                do="if you trust its source, give --trust-pickle"
                 " (`trust_pickle=True`); or save it with np.savez, one array for each view",
             )
         elif one.name == "train":
-            raise CaptureError("there are no events", where=folder, do=f"it needs {sums.name}")
+            raise CaptureError("there are no events", where=folder, do=f"add {sums.name}")
     return streams, _thresholds(folder, threshold), notes
 
 
 def _thresholds(folder: Path, threshold: float | None) -> Thresholds | None:
-    """Those given or found; or those stated, if both signs' are."""
+    """The threshold given or found, else those that the file states for both signs."""
     if threshold is not None:
         return Thresholds(threshold, threshold)
     path = folder / "transforms_train.json"
@@ -263,12 +264,13 @@ def _one_each(
             "there must be an array of (t, x, y, p) for each view",
             where=path,
             got=f"{len(found)} arrays for {one.count} views, shapes {wrong[:3] or 'as expected'}",
+            do="save one array of four columns for each view",
         )
     return found
 
 
 def _raw(array: Shaped[np.ndarray, "n 4"], path: Path) -> EventStream:
-    """A stream whose size is not known yet."""
+    """A stream whose sensor resolution is not known yet."""
     t, x, y, p = array.T
     return EventStream(
         x=coordinates(x.astype(np.int64), "x", path),
@@ -281,19 +283,19 @@ def _raw(array: Shaped[np.ndarray, "n 4"], path: Path) -> EventStream:
 
 
 def _summed(path: Path, one: _Set, threshold: float | None) -> tuple[list[EventStream], float]:
-    """Streams from sums over windows, and the threshold they are made of."""
+    """Streams from sums over windows, and their threshold."""
     sums = load_array(path)
     t_us = one.views.t_us[: len(one.views) // one.count]
     windows = len(t_us) - 1
     if sums.ndim != 4 or sums.shape[0] != one.count or sums.shape[1] not in (windows, windows + 1):
         raise CaptureError(
-            "the sums of events do not fit the views",
+            "the sums of events do not match the views",
             where=path,
             got=f"shape {sums.shape}",
             do=f"it must be ({one.count}, {windows} or {windows + 1}, height, width)",
         )
     step = threshold or smallest_step(sums)
-    each = [unbinned(view[:windows], t_us, threshold=step, where=path) for view in sums]
+    each = [events_from_sums(view[:windows], t_us, threshold=step, where=path) for view in sums]
     return each, step
 
 
@@ -303,20 +305,21 @@ def _camera(
     images: Shaped[np.ndarray, "n h w c"] | None,
     folder: Path,
 ) -> Camera:
-    """Of the size of images or sums; raw streams do not know it."""
+    """The camera, with the size of images or sums; raw streams do not have it."""
     sizes = {(one.width, one.height) for one in streams if one.width}
     sizes |= set() if images is None else {(images.shape[2], images.shape[1])}
     if len(sizes) != 1:
         raise CaptureError(
-            "images and events differ in size" if sizes else "the size of the sensor is not known",
+            "images and events differ in size" if sizes else "the sensor resolution is unknown",
             where=folder,
             got=f"{sorted(sizes)}" if sizes else "no image and no sums of events",
+            do="add data_frames_train.npy or images, of one size",
         )
     return views.camera(*sizes.pop())
 
 
 def _rig(streams: list[EventStream], first: int, camera: Camera, where: Path) -> EventStream:
-    """One stream of several views, numbered from `first`."""
+    """One stream of several views, on tracks from `first` on."""
     sized = [
         replace(
             one,

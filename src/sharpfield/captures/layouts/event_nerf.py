@@ -1,13 +1,13 @@
-"""EventNeRF's data: one colour event camera that goes around a scene once.
+"""EventNeRF's data: one colour event camera that circles a scene once.
 
     train/pose/*.txt          camera-to-world, 16 numbers, OpenCV axes; pose i of n at i / (n - 1)
     train/intrinsics/*.txt    16 numbers (a 4x4 matrix), or 20: a fifth row begins with k1, k2
-    train/events/NAME.npz     x, y, t, p; t in a unit that the files do not say
-    train/rgb/*.png           a image for each pose, if there are any
-    test/, validation/        pose, intrinsics and rgb of other views, if there are any
+    train/events/NAME.npz     x, y, t, p; the files do not state the unit of t
+    train/rgb/*.png           an image for each pose, optional
+    test/, validation/        pose, intrinsics and rgb of other views, optional
 
-Time runs from 0 to the last event's. Its unit must be given: the authors only use t over its
-maximum. Poses are joined by straight lines. The sensor has an RGGB filter.
+Time runs from 0 to the last event. Its unit must be given: the authors only use t relative to its
+maximum. Poses are interpolated linearly. The sensor has an RGGB filter.
 
 Source: Rudnev et al., *EventNeRF* (CVPR 2023), and its data loader; NeRF++ for the layout.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts.nerfstudio import guessed_bounds
+from sharpfield.captures.layouts.nerfstudio import estimated_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.errors import CaptureError
@@ -30,12 +30,12 @@ from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.images import list_images, read_images
 
 SENSOR = (346, 260)
-"""Width and height in px of the authors' sensor, real and simulated."""
+"""Sensor resolution of the authors, real and simulated: width and height in pixels."""
 TILE = "RGGB"
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder looks like such data."""
+    """Whether a folder has this layout."""
     train = folder / "train"
     return (train / "pose").is_dir() and any((train / "events").glob("*.npz"))
 
@@ -48,18 +48,22 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         options: `event_unit` is required.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together, or the unit is
-            not given.
+        CaptureError: Something is missing, malformed, or inconsistent, or the unit is not given.
     """
     train = folder / "train"
     files = sorted((train / "events").glob("*.npz"))
     if len(files) != 1:
-        raise CaptureError("there must be one file of events", where=train / "events", got=files)
+        raise CaptureError(
+            "there must be one file of events",
+            where=train / "events",
+            got=", ".join(file.name for file in files) or "none",
+            do="read each recording as a capture of its own",
+        )
     poses, camera = _poses(train), _camera(train)
     with open_events(files[0], unit=options.event_unit, size=SENSOR) as file:
         if file.unit is None:
             raise CaptureError(
-                "EventNeRF's files do not say the unit of their event times",
+                "EventNeRF's files do not state the unit of their event times",
                 where=files[0],
                 do="give it with --event-unit (`event_unit`): ns, us, ms or s",
             )
@@ -69,6 +73,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             "there must be events, and at least two poses",
             where=train,
             got=f"{len(events)} events, {len(poses)} poses",
+            do="complete the download",
         )
     clock = Clock(0, int(events.t_us[-1]))
     times_us = np.rint(np.linspace(0, clock.span_us, len(poses))).astype(np.int64)
@@ -77,7 +82,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     held_out = next((other for other in others if _images(other)), None)
     still = np.zeros((0, 3, 4)) if held_out is None else _poses(held_out)
     frames, split = _frames(train, held_out, times_us, len(still))
-    near, far = guessed_bounds(poses)
+    near, far = estimated_bounds(poses)
     return Capture(
         camera=camera,
         trajectory=Tracks([path], still) if len(still) else path,
@@ -109,6 +114,7 @@ def _frames(
                 f"there must be a pose for each {name} image",
                 where=found[0].parent,
                 got=f"{len(found)} images, {poses} poses",
+                do="complete the download",
             )
     if not moving and not still:
         return None, Split(np.zeros(0, np.int64), np.zeros(0, np.int64))
@@ -128,12 +134,14 @@ def _camera(train: Path) -> Camera:
     """The camera, which all poses share."""
     files = sorted((train / "intrinsics").glob("*.txt"))
     if not files:
-        raise CaptureError("there are no intrinsics", where=train / "intrinsics")
+        raise CaptureError(
+            "there are no intrinsics", where=train / "intrinsics", do="add NAME.txt of 16 numbers"
+        )
     numbers = _numbers(files[0], (16, 20))
-    matrix, bent = numbers[:16].reshape(4, 4), numbers[16:18]
+    matrix, radial = numbers[:16].reshape(4, 4), numbers[16:18]
     lens, distortion = "pinhole", ()
-    if bent.any():
-        lens, distortion = "brown", (float(bent[0]), float(bent[1]), 0.0, 0.0, 0.0)
+    if radial.any():
+        lens, distortion = "brown", (float(radial[0]), float(radial[1]), 0.0, 0.0, 0.0)
     fx, fy, cx, cy = (float(matrix[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return Camera(*SENSOR, fx, fy, cx, cy, lens, distortion)
 
@@ -141,14 +149,16 @@ def _camera(train: Path) -> Camera:
 def _poses(folder: Path) -> Float64[np.ndarray, "p 3 4"]:
     files = sorted((folder / "pose").glob("*.txt"))
     if not files:
-        raise CaptureError("there are no poses", where=folder / "pose")
+        raise CaptureError(
+            "there are no poses", where=folder / "pose", do="add NAME.txt of 16 numbers"
+        )
     poses = np.stack([_numbers(file, (16,)).reshape(4, 4)[:3] for file in files])
     check_poses(poses, folder / "pose")
     return poses
 
 
 def _numbers(path: Path, counts: tuple[int, ...]) -> Shaped[np.ndarray, "n"]:
-    """The numbers of a text file, as many as there may be."""
+    """The numbers of a text file, whose count must be one of `counts`."""
     try:
         numbers = np.array([float(word) for word in path.read_text().split()])
     except (ValueError, UnicodeDecodeError) as error:

@@ -2,7 +2,7 @@
 
     images_1/NN.png             8-bit RGB, sorted by name
     images_1/timestamps.npz     timestamps_start, timestamps_end: us, one per image; equal if sharp
-    poses_bounds.npy            one row per image, see `captures.poses_bounds`
+    poses_bounds.npy            one row per image, see `layouts._poses_bounds`
     all_poses_bounds.npy        the trajectory, one row per stamp
     all_timestamps.npy          its stamps, us
     events.h5                   x, y, t, p
@@ -47,24 +47,24 @@ from sharpfield.storage.images import list_images, read_images
 TRAJECTORY = ("all_poses_bounds.npy", "all_timestamps.npy")
 
 OFF_TRAJECTORY_PX = 1.0
-"""A frame whose own pose would move the nearest things by more than this in the image, against
-the trajectory at its time, was not taken on the trajectory."""
+"""A frame is off the trajectory if its own pose, compared with the trajectory at its time, would
+move the nearest points by more than this in the image."""
 
 RGGB = np.array([[0, 1], [1, 2]], np.int8)
-"""Channels of the colour filter tile of a Color-DAVIS346."""
+"""Channels of the Bayer tile of a Color-DAVIS346."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """What the files of one of the two data sets leave unsaid."""
+    """What the files of one of the two data sets do not state."""
 
     event_unit: str
     encoding: str
     hold_out: str
     threshold: float
-    """Contrast threshold for both signs that the authors use."""
+    """Contrast threshold of the authors for both signs, natural log."""
     reference_poses: Literal["frames", "trajectory"]
-    """The poses that their normalisation is taken over."""
+    """The poses over which the authors normalise the scene."""
 
 
 BLENDER = Variant("ns", "gamma2.2", "every:8", 0.2, "frames")
@@ -72,7 +72,7 @@ COLOR_DAVIS = Variant("us", "linear", "last:5", 0.25, "trajectory")
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has this layout: a trajectory's files, or a pose table and events."""
+    """Whether a folder has this layout: the files of a trajectory, or a pose table and events."""
     named = [(folder / name).is_file() for name in ("poses_bounds.npy", "events.h5")]
     return all(named) or any((folder / name).is_file() for name in TRAJECTORY)
 
@@ -85,8 +85,8 @@ def variant_of(folder: Path) -> Variant:
 def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a scene.
 
-    Frames taken on the trajectory are on track 0. A sharp frame taken before or after it, and any
-    whose own pose contradicts it, gets a still track of its own.
+    Frames on the trajectory are on track 0. A sharp frame before or after it, and any frame whose
+    own pose contradicts it, has a still track of its own.
 
     Args:
         folder: Holds what the module describes.
@@ -94,7 +94,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
             us with it); `hold_out`.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     variant = variant_of(folder)
     image_folder = choose_images(folder, None)
@@ -139,7 +139,7 @@ def _exposure(path: Path) -> Exposure:
                 f"array {name} is missing",
                 where=path,
                 got=", ".join(times) or "no arrays",
-                do="store when each exposure began and ended, in us",
+                do="store the start and end of each exposure, in us",
             )
         columns.append(whole_us(times[name], "us", f"{path}, {name}"))
     _expect_one_each(path, starts=len(columns[0]), ends=len(columns[1]))
@@ -165,7 +165,7 @@ def _trajectory(folder: Path) -> tuple[PosesBounds, Stamped]:
 
 
 def _camera(images: Shaped[np.ndarray, "n h w c"], table: PosesBounds, *, factor: float) -> Camera:
-    """The table's own image size is not used, only its focal length: so did the authors."""
+    """The camera; of the table only the focal length is used, as the authors do."""
     height, width = images.shape[1:3]
     focal = table.focal_px / factor
     return Camera(width, height, focal, focal, width / 2, height / 2)
@@ -179,21 +179,21 @@ def _factor(images: Path) -> float:
 def _off_trajectory(
     path: Stamped, table: PosesBounds, exposure: Exposure, camera: Camera, *, near: float
 ) -> Bool[np.ndarray, "n"]:
-    """Which frames were not taken on the trajectory."""
+    """Which frames are off the trajectory."""
     first, last = path.known_us(0)
     begin, end = exposure.open_us + POSE_TOLERANCE_US, exposure.close_us - POSE_TOLERANCE_US
     outside = exposure.instant & ((begin < first) | (end > last))
     time = torch.from_numpy(path.clock.unit(exposure.middle_us))
     expected = path.pose(time, torch.zeros(len(table)).long())
     twist = se3.log(se3.compose(se3.inverse(expected), torch.from_numpy(table.poses))).numpy()
-    turned, shifted = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
-    return outside | (camera.fx_px * (turned + shifted / near) > OFF_TRAJECTORY_PX)
+    angle, distance = np.linalg.norm(twist[:, :3], axis=1), np.linalg.norm(twist[:, 3:], axis=1)
+    return outside | (camera.fx_px * (angle + distance / near) > OFF_TRAJECTORY_PX)
 
 
 def _tracks(
     path: Stamped, table: PosesBounds, off: Bool[np.ndarray, "n"]
 ) -> tuple[Trajectory, Int64[np.ndarray, "n"]]:
-    """The trajectory with a still track for each frame that is off it, and the track of each."""
+    """The trajectory with a still track for each frame off it, and the track of each frame."""
     if not off.any():
         return path, np.zeros(len(off), np.int64)
     return Tracks([path], table.poses[off]), np.where(off, np.cumsum(off), 0).astype(np.int64)
@@ -202,7 +202,7 @@ def _tracks(
 def _events(
     folder: Path, camera: Camera, path: Stamped, *, event_unit: str | None, variant: Variant
 ) -> tuple[EventStream, Thresholds, dict[str, Note]]:
-    """Events while the pose is known, their thresholds, and what was done to them."""
+    """Events while poses are known, their thresholds, and remarks."""
     known_us = path.known_us(0)
     notes: dict[str, Note] = {}
     with open_events(folder / "events.h5", unit=event_unit, size=camera.size) as opened:
@@ -230,16 +230,16 @@ def _site_colour(path: Path, camera: Camera) -> SiteColour:
     for name in ("inv_mapx", "inv_mapy"):
         if name not in maps or maps[name].shape != shape:
             raise CaptureError(
-                f"array {name} is missing, or not of the sensor's size",
+                f"array {name} is missing, or differs from the sensor in size",
                 where=path,
                 got=", ".join(f"{key} {value.shape}" for key, value in maps.items()),
                 do=f"it must be {shape}",
             )
-    tiled = np.tile(RGGB, (camera.height // 2 + 1, camera.width // 2 + 1))
+    channel = np.tile(RGGB, (camera.height // 2 + 1, camera.width // 2 + 1))
     return SiteColour(
         maps["inv_mapx"].ravel().astype(np.float32),
         maps["inv_mapy"].ravel().astype(np.float32),
-        tiled[: camera.height, : camera.width].ravel(),
+        channel[: camera.height, : camera.width].ravel(),
     )
 
 
@@ -255,9 +255,10 @@ def _truth(
         image = given[names[i]]
         if image.shape != images.shape[1:] or image.dtype != images.dtype:
             raise CaptureError(
-                "sharp image differs from the frame in size or type",
+                "a sharp image differs from the frame in size or type",
                 where=f"{path}, {names[i]}",
                 got=f"{image.dtype} {image.shape}, frame {images.dtype} {images.shape[1:]}",
+                do="store sharp images with the size and type of the frames",
             )
         truth[i] = image
     return truth, known

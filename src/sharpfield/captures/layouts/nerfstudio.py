@@ -43,11 +43,11 @@ from sharpfield.storage.images import read_images
 from sharpfield.storage.ply import columns, read_ply
 
 NEAR, FAR = 0.1, 10.0
-"""Guessed depth bounds, as multiples of the cameras' distance from what they look at."""
+"""Estimated depth bounds, relative to the distance of the cameras from their common focus."""
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder looks like such a scene."""
+    """Whether a folder has this layout."""
     return (folder / "transforms.json").is_file()
 
 
@@ -56,11 +56,11 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
 
     Args:
         folder: Holds `transforms.json`.
-        options: `bounds`, by default guessed from where the cameras look, since the format does
-            not say; `missing` images; `hold_out`, where no list of frames says.
+        options: `bounds`, by default estimated from the focus of the cameras, since the format
+            does not state them; `missing` images; `hold_out`, where there are no lists of frames.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     path = folder / "transforms.json"
     content = read_json(path)
@@ -80,7 +80,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     return photo_capture(
         photos,
         _split(content, names, path, options.hold_out or HOLD_OUT),
-        bounds=options.bounds or guessed_bounds(poses),
+        bounds=options.bounds or estimated_bounds(poses),
         name=folder.resolve().name,
         source="nerfstudio",
         points=_points(folder, content, path),
@@ -88,8 +88,8 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     )
 
 
-def guessed_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
-    """Depth bounds from the point that all cameras look at, and how far away it is.
+def estimated_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
+    """Depth bounds estimated from the point nearest to all optical axes.
 
     Where the axes are parallel there is none; then it is put at ten times the spread of the
     cameras.
@@ -109,8 +109,8 @@ def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.nda
         return None
     if not isinstance(named, str):
         raise CaptureError("`ply_file_path` must be text", where=path, got=named)
-    place = folder / named
-    points = columns(read_ply(place), ("x", "y", "z"), where=place).astype(np.float64)
+    ply = folder / named
+    points = columns(read_ply(ply), ("x", "y", "z"), where=ply).astype(np.float64)
     return points if len(points) else None
 
 
@@ -151,7 +151,9 @@ def _split(content: dict[str, Any], names: list[str], path: Path, hold_out: str)
     )
     if not len(split.train):
         raise CaptureError(
-            "none of the frames is for training", where=f"{path}, key `train_filenames`"
+            "none of the frames is for training",
+            where=f"{path}, key `train_filenames`",
+            do="list frames by their `file_path`",
         )
     return split
 

@@ -5,11 +5,11 @@
                               world-from-camera, OpenCV axes
     camera_calibration.npz    intrinsics, distortion, img_height, img_width, bayer_pattern,
                               thresholds, refractory period in ns
-    views/transforms_test.json, or ../views/     images to be predicted, if there are any
+    views/transforms_test.json, or ../views/     test images, optional
 
-Intrinsics count pixels from the centre of the first, ours from its corner. Poses are joined by
-straight lines. Images of another size than the event camera's, or not PNG or JPEG, are left out,
-and the notes say so.
+Their intrinsics have the origin at the centre of the first pixel, ours at its corner. Poses are
+interpolated linearly. Images of another size than the event camera, or other than PNG or JPEG, are
+left out, with a note.
 
 Source: Low and Lee, *Robust e-NeRF* (ICCV 2023), and its data loader.
 """
@@ -29,7 +29,7 @@ from sharpfield.captures.layouts._transforms import (
     poses_of,
     read_json,
 )
-from sharpfield.captures.layouts.nerfstudio import guessed_bounds
+from sharpfield.captures.layouts.nerfstudio import estimated_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
@@ -51,21 +51,21 @@ Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder looks like such data."""
+    """Whether a folder has this layout."""
     return all((folder / file).is_file() for file in (EVENTS, POSES, CALIBRATION))
 
 
 def read(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
-    """Read the events, the poses, and the images to be predicted.
+    """Read the events, the poses, and the test images.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     calibration = _arrays(folder / CALIBRATION, ("intrinsics", "img_height", "img_width"))
     camera = _camera(calibration, folder / CALIBRATION)
     path = _trajectory(folder / POSES)
     events = _events(folder / EVENTS, camera, str(calibration.get("bayer_pattern", "")))
-    near, far = guessed_bounds(path.poses)
+    near, far = estimated_bounds(path.poses)
     views = _views(folder, camera, path.clock)
     none = np.zeros(0, np.int64)
     return Capture(
@@ -89,26 +89,29 @@ def _arrays(path: Path, needed: tuple[str, ...]) -> Arrays:
     lacking = [name for name in needed if name not in found]
     if lacking:
         raise CaptureError(
-            f"array {lacking[0]} is missing", where=path, got=", ".join(found) or "no arrays"
+            f"array {lacking[0]} is missing",
+            where=path,
+            got=", ".join(found) or "no arrays",
+            do="add it",
         )
     return found
 
 
 def _camera(calibration: Arrays, path: Path) -> Camera:
     matrix = np.asarray(calibration["intrinsics"], np.float64)
-    bent = np.atleast_1d(np.asarray(calibration.get("distortion_params", []), np.float64))
+    coefficients = np.atleast_1d(np.asarray(calibration.get("distortion_params", []), np.float64))
     model = str(calibration.get("distortion_model", ""))
     lens, distortion = PINHOLE, ()
-    if bent.size and bent.any():
+    if coefficients.size and coefficients.any():
         lens = lens_in_calibration(model)
-        if lens is None or bent.shape != (4,) or lens.fewest != 4:
+        if lens is None or coefficients.shape != (4,) or lens.fewest != 4:
             raise CaptureError(
                 "distortion model is not supported",
                 where=path,
-                got=f"{model!r} with {bent.size} coefficients",
+                got=f"{model!r} with {coefficients.size} coefficients",
                 do=f"use one of {', '.join(DISTORTION)} with 4, or undistort the events",
             )
-        distortion = lens.padded(bent.tolist())
+        distortion = lens.padded(coefficients.tolist())
     width, height = (int(calibration[name].item()) for name in ("img_width", "img_height"))
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
     cx, cy = float(matrix[0, 2]) + 0.5, float(matrix[1, 2]) + 0.5
@@ -124,6 +127,7 @@ def _trajectory(path: Path) -> Stamped:
             "there must be a position, an orientation and a time for each of several poses",
             where=path,
             got=f"{len(position)}, {len(xyzw)} and {len(stamps)}",
+            do="complete the download",
         )
     wxyz = torch.from_numpy(np.roll(np.asarray(xyzw, np.float64), 1, axis=1))
     rotation = se3.rotation_from_quaternion(wxyz / wxyz.norm(dim=-1, keepdim=True)).numpy()
@@ -137,7 +141,12 @@ def _events(path: Path, camera: Camera, bayer: str) -> EventStream:
     found = _arrays(path, ("position", "timestamp", "polarity"))
     position = found["position"]
     if position.ndim != 2 or position.shape[1] != 2:
-        raise CaptureError("positions must be pairs", where=path, got=f"shape {position.shape}")
+        raise CaptureError(
+            "positions of events must be pairs",
+            where=path,
+            got=f"shape {position.shape}",
+            do="store `position` as [n, 2]: x, y",
+        )
     events = EventStream(
         x=coordinates(np.ascontiguousarray(position[:, 0]), "x", path),
         y=coordinates(np.ascontiguousarray(position[:, 1]), "y", path),
@@ -168,12 +177,12 @@ def _known(calibration: Arrays) -> Known:
 
 @dataclass(frozen=True)
 class _Views:
-    """Images to be predicted, each on a still track of its own."""
+    """Test images, each on a still track of its own."""
 
     frames: Frames | None = None
     poses: Float64[np.ndarray, "v 3 4"] = field(default_factory=lambda: np.zeros((0, 3, 4)))
     left_out: str = ""
-    """Why there are none, though some are listed."""
+    """Why listed images were left out."""
 
 
 def _views(folder: Path, camera: Camera, clock: Clock) -> _Views:

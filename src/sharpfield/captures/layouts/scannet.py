@@ -1,15 +1,15 @@
-"""ScanNet scenes, and whatever else was exported to their layout (Habitat renders, for instance).
+"""ScanNet scenes, and other data in their layout (such as Habitat renders).
 
-    color/0.jpg, ...           RGB; `rgb/` and PNG are found, too
-    depth/0.png, ...           16 bit, millimetres, 0 where unknown; of another size than colour
-    pose/0.txt, ...            4x4, world from camera; -inf, or no file, where tracking failed
+    color/0.jpg, ...           RGB; or in `rgb/`, or PNG
+    depth/0.png, ...           16 bit, millimetres, 0 where unknown; its size differs from colour
+    pose/0.txt, ...            4x4, world-from-camera; -inf, or no file, where tracking failed
     intrinsic/intrinsic_color.txt, intrinsic_depth.txt     4x4
-    truth/0.png, truth/blur_px.txt    ours: sharp frames and true blur, where simulated
-    SCENE_vh_clean.ply         optional, here or above: vertices of the reconstructed mesh
+    truth/0.png, truth/blur_px.txt    our extension: sharp frames and true blur of simulations
+    SCENE_vh_clean.ply         optional, beside `exported/`: vertices of the reconstructed mesh
 
-All of it lies in the scene's folder or in `exported/` there. Colour larger than 640x480 is brought
-to that size, and one frame in five is learned from, as Point-NeRF and Hybrid Neural Rendering
-published it.
+The files lie in the scene's folder or in `exported/` there. Colour images larger than 640x480 are
+downscaled to that size, and one frame in five is for training, as published by Point-NeRF and
+Hybrid Neural Rendering.
 
 Source: Dai et al., *ScanNet* (CVPR 2017).
 """
@@ -39,7 +39,7 @@ from sharpfield.storage.images import SUFFIXES, image_stack, read_image
 from sharpfield.storage.ply import columns, read_ply
 
 PUBLISHED_SPLIT = "train:5"
-"""One frame in five is learned from, see `captures.hold_out`."""
+"""One frame in five is for training, see `captures.hold_out`."""
 COLOUR, DEPTH, POSE, TRUTH = ("color", "rgb"), "depth", "pose", "truth"
 BLUR = "blur_px.txt"
 INTRINSIC_COLOUR = Path("intrinsic") / "intrinsic_color.txt"
@@ -48,8 +48,8 @@ INTRINSIC_DEPTH = Path("intrinsic") / "intrinsic_depth.txt"
 
 def recognise(folder: Path) -> bool:
     """Whether a folder has this layout, itself or in `exported/`."""
-    place = _place(folder)
-    return (place / POSE).is_dir() and (place / INTRINSIC_COLOUR).is_file() and bool(_colour(place))
+    inner = _inner(folder)
+    return (inner / POSE).is_dir() and (inner / INTRINSIC_COLOUR).is_file() and bool(_colour(inner))
 
 
 def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
@@ -60,27 +60,27 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         options: `hold_out`.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
-    place = _place(folder)
-    colour = _colour(place)
+    inner = _inner(folder)
+    colour = _colour(inner)
     names = [path.stem for path in colour]
     first = read_image(colour[0])
-    maps = [place / DEPTH / f"{name}.png" for name in names]
+    maps = [inner / DEPTH / f"{name}.png" for name in names]
     measured = np.array([path.is_file() for path in maps])
     camera = pinhole(
-        read_matrix(place / INTRINSIC_COLOUR), first.shape[1::-1], where=place / INTRINSIC_COLOUR
+        read_matrix(inner / INTRINSIC_COLOUR), first.shape[1::-1], where=inner / INTRINSIC_COLOUR
     )
     frames = RgbdFrames(
         names=names,
-        poses=np.stack([_pose(place / POSE / f"{name}.txt") for name in names]),
+        poses=np.stack([_pose(inner / POSE / f"{name}.txt") for name in names]),
         colour=lambda row: rgb(colour[row]),
         depth=lambda row: decode_depth(maps[row]),
         measured=measured,
         camera=camera,
-        depth_camera=_depth_camera(place, maps[int(np.argmax(measured))]) or camera,
+        depth_camera=_depth_camera(inner, maps[int(np.argmax(measured))]) or camera,
         sources=colour,
-        depth_sources=[path for path, there in zip(maps, measured, strict=True) if there],
+        depth_sources=[path for path, known in zip(maps, measured, strict=True) if known],
     )
     made = rgbd_capture(
         frames,
@@ -89,23 +89,28 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         source="scannet",
         points=_mesh(folder),
     )
-    return _with_truth(made, place, np.flatnonzero(usable_poses(frames.poses)))
+    return _with_truth(made, inner, np.flatnonzero(usable_poses(frames.poses)))
 
 
 def rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """A colour image of 8 bit.
+    """Read an 8-bit image as RGB.
 
     Raises:
-        CaptureError: It is something else.
+        CaptureError: The image does not have 8 bits.
     """
     image = read_image(path)
     if image.dtype != np.uint8:
-        raise CaptureError("a colour image must have 8 bits", where=path, got=image.dtype)
+        raise CaptureError(
+            "a colour image must have 8 bits",
+            where=path,
+            got=image.dtype,
+            do="convert it to 8 bits",
+        )
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.shape[-1] == 1 else image
 
 
 def by_number(folder: Path) -> list[Path]:
-    """Images of a folder in the order of the numbers in their names."""
+    """Images of a folder, in the order of the numbers in their names."""
     found = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
     return sorted(found, key=_number)
 
@@ -114,13 +119,13 @@ def _number(path: Path) -> tuple[int, Path]:
     return int("".join(filter(str.isdigit, path.stem)) or -1), path
 
 
-def _place(folder: Path) -> Path:
+def _inner(folder: Path) -> Path:
     return folder / "exported" if (folder / "exported").is_dir() else folder
 
 
-def _colour(place: Path) -> list[Path]:
+def _colour(inner: Path) -> list[Path]:
     for name in COLOUR:
-        if found := by_number(place / name):
+        if found := by_number(inner / name):
             return found
     return []
 
@@ -129,12 +134,12 @@ def _pose(path: Path) -> Float64[np.ndarray, "3 4"]:
     return read_pose(path) if path.is_file() else np.full((3, 4), np.nan)
 
 
-def _depth_camera(place: Path, path: Path) -> Camera | None:
-    """That of a depth map; None if the map is not there."""
+def _depth_camera(inner: Path, path: Path) -> Camera | None:
+    """The camera of a depth map; None if the map does not exist."""
     if not path.is_file():
         return None
-    matrix = read_matrix(place / INTRINSIC_DEPTH)
-    return pinhole(matrix, decode_depth(path).shape[::-1], where=place / INTRINSIC_DEPTH)
+    matrix = read_matrix(inner / INTRINSIC_DEPTH)
+    return pinhole(matrix, decode_depth(path).shape[::-1], where=inner / INTRINSIC_DEPTH)
 
 
 def _mesh(folder: Path) -> Float64[np.ndarray, "m 3"] | None:
@@ -143,10 +148,10 @@ def _mesh(folder: Path) -> Float64[np.ndarray, "m 3"] | None:
     return None
 
 
-def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> Capture:
-    """The sharp frames that a simulation wrote beside, and how blurred the others are."""
+def _with_truth(capture: Capture, inner: Path, kept: Int64[np.ndarray, "n"]) -> Capture:
+    """The capture with the sharp frames and the true blur that a simulation wrote."""
     frames = capture.needed_frames
-    paths = [place / TRUTH / f"{name}.png" for name in frames.names]
+    paths = [inner / TRUTH / f"{name}.png" for name in frames.names]
     known = np.array([path.is_file() for path in paths])
     if known.any():
         unknown = np.zeros(frames.images.shape[1:], np.uint8)
@@ -157,8 +162,8 @@ def _with_truth(capture: Capture, place: Path, kept: Int64[np.ndarray, "n"]) -> 
             kind="truth",
         )
         frames = replace(frames, truth=truth, truth_known=known)
-    if (place / TRUTH / BLUR).is_file():
-        frames = replace(frames, blur_px=read_matrix(place / TRUTH / BLUR)[kept, 0])
+    if (inner / TRUTH / BLUR).is_file():
+        frames = replace(frames, blur_px=read_matrix(inner / TRUTH / BLUR)[kept, 0])
     return replace(capture, frames=frames)
 
 

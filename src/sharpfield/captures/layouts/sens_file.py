@@ -7,7 +7,7 @@
     each frame: f32 4x4 world from camera; u64 times of colour and depth in us;
     u64 bytes of colour and of depth; both
 
-Frames are found by their lengths, so that one can be decoded without the others.
+The position of each frame follows from the lengths, so frames are decoded one by one.
 
 Source: Dai et al., *ScanNet* (CVPR 2017), description of its sensor files.
 """
@@ -31,15 +31,15 @@ from sharpfield.core.errors import CaptureError
 
 VERSION = 4
 COLOUR_IMAGES, DEPTH_RAW, DEPTH_ZLIB = (1, 2), 0, 1
-"""Kinds of compression that are read."""
+"""Supported compressions."""
 LONGEST_NAME = 4096
 FRAME = struct.Struct("<16fQQQQ")
-"""What stands before the bytes of a frame."""
+"""The header of a frame."""
 
 
 @dataclass(frozen=True)
 class SensFile:
-    """Where everything is in a file."""
+    """The positions of all frames in a file."""
 
     path: Path
     intrinsics: Float64[np.ndarray, "2 4 4"]
@@ -51,30 +51,32 @@ class SensFile:
     steps_per_metre: float
     poses: Float64[np.ndarray, "n 3 4"]
     """World-from-camera; not finite where tracking failed."""
-    at: Int64[np.ndarray, "n"]
-    """Where the colour of each frame begins."""
+    offset: Int64[np.ndarray, "n"]
+    """Offset of the colour image of each frame, in bytes."""
     lengths: Int64[np.ndarray, "n 2"]
-    """Bytes of colour and depth."""
+    """Length of colour and depth of each frame, in bytes."""
 
     def colour(self, frame: int) -> UInt8[np.ndarray, "h w 3"]:
-        """The image of a frame.
+        """Decode the colour image of a frame.
 
         Raises:
             CaptureError: It cannot be decoded.
         """
-        data = self._bytes(int(self.at[frame]), int(self.lengths[frame, 0]))
+        data = self._bytes(int(self.offset[frame]), int(self.lengths[frame, 0]))
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         if image is None:
-            raise CaptureError("cannot decode image", where=f"{self.path}, frame {frame}")
+            raise CaptureError(
+                "cannot decode image", where=f"{self.path}, frame {frame}", do="copy the file again"
+            )
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
     def depth(self, frame: int) -> UInt16[np.ndarray, "y x"]:
-        """The depth of a frame in mm.
+        """Decode the depth map of a frame, in mm.
 
         Raises:
             CaptureError: It cannot be decoded.
         """
-        start = int(self.at[frame] + self.lengths[frame, 0])
+        start = int(self.offset[frame] + self.lengths[frame, 0])
         data = self._bytes(start, int(self.lengths[frame, 1]))
         width, height = self.depth_size
         try:
@@ -82,7 +84,10 @@ class SensFile:
             steps = np.frombuffer(raw, "<u2").reshape(height, width)
         except (zlib.error, ValueError) as error:
             raise CaptureError(
-                "cannot decode depth", where=f"{self.path}, frame {frame}", got=error
+                "cannot decode depth",
+                where=f"{self.path}, frame {frame}",
+                got=error,
+                do="copy the file again",
             ) from None
         if self.steps_per_metre == 1000:
             return steps.astype(np.uint16)
@@ -96,7 +101,7 @@ class SensFile:
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder holds such a file."""
+    """Whether a folder has this layout."""
     return len(list(folder.glob("*.sens"))) == 1
 
 
@@ -108,15 +113,15 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         options: `hold_out`.
 
     Raises:
-        CaptureError: The file is malformed or cut off.
+        CaptureError: The file is malformed or truncated.
     """
     path = next(iter(sorted(folder.glob("*.sens"))), None)
     if path is None:
-        raise CaptureError("there is no .sens file", where=folder)
+        raise CaptureError("there is no .sens file", where=folder, do="it must hold one")
     file = open_sens(path)
     colour, depth = file.intrinsics
     frames = RgbdFrames(
-        names=[str(i) for i in range(len(file.at))],
+        names=[str(i) for i in range(len(file.offset))],
         poses=file.poses,
         colour=file.colour,
         depth=file.depth,
@@ -135,10 +140,10 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
 
 
 def open_sens(path: Path) -> SensFile:
-    """Find everything in a file without decoding it.
+    """Locate all frames of a file without decoding them.
 
     Raises:
-        CaptureError: It is malformed or cut off.
+        CaptureError: The file is malformed or truncated.
     """
     with path.open("rb") as file:
         try:
@@ -156,7 +161,7 @@ def _index(file: BinaryIO, path: Path) -> SensFile:
     version, length = _unpack(file, "<IQ")
     if version != VERSION or length > LONGEST_NAME:
         raise CaptureError(
-            "not a .sens file of the version that can be read",
+            "unsupported version of a .sens file",
             where=path,
             got=f"version {version}",
             do=f"give one of version {VERSION}",
@@ -166,19 +171,19 @@ def _index(file: BinaryIO, path: Path) -> SensFile:
     colour_kind, depth_kind = _unpack(file, "<ii")
     if colour_kind not in COLOUR_IMAGES or depth_kind not in (DEPTH_RAW, DEPTH_ZLIB):
         raise CaptureError(
-            "this compression of a .sens file cannot be read",
+            "unsupported compression of a .sens file",
             where=path,
             got=f"colour {colour_kind}, depth {depth_kind}",
             do="export it with ScanNet's own reader",
         )
     sizes = _unpack(file, "<IIII")
     steps_per_metre, count = _unpack(file, "<fQ")
-    poses, at, lengths = [], [], []
+    poses, offset, lengths = [], [], []
     end = path.stat().st_size
     for _ in range(count):
         *pose, _, _, colour, depth = FRAME.unpack(file.read(FRAME.size))
         poses.append(np.array(pose).reshape(4, 4)[:3])
-        at.append(file.tell())
+        offset.append(file.tell())
         lengths.append((colour, depth))
         if file.tell() + colour + depth > end:
             raise struct.error
@@ -191,7 +196,7 @@ def _index(file: BinaryIO, path: Path) -> SensFile:
         depth_kind=depth_kind,
         steps_per_metre=float(steps_per_metre),
         poses=np.array(poses, np.float64).reshape(-1, 3, 4),
-        at=np.array(at, np.int64),
+        offset=np.array(offset, np.int64),
         lengths=np.array(lengths, np.int64).reshape(-1, 2),
     )
 

@@ -2,11 +2,11 @@
 
     frame-000000.color.png     RGB
     frame-000000.depth.png     16 bit, millimetres; 0 or 65535 where unknown
-    frame-000000.pose.txt      4x4, world from camera
+    frame-000000.pose.txt      4x4, world-from-camera
 
 A folder is one sequence, or a scene with sequences in `seq-01/`, ...; then `TrainSplit.txt` and
-`TestSplit.txt` name (`sequence1`) which are learned from and which held out. The intrinsics are not
-in the files: both images have a focal length of 585 px and their centre in the middle.
+`TestSplit.txt` list (`sequence1`) those for training and for testing. The files have no intrinsics:
+both images have a focal length of 585 px and the principal point in the middle.
 
 Source: Shotton et al., *Scene coordinate regression forests* (CVPR 2013), its data set.
 """
@@ -32,21 +32,21 @@ SPLITS = ("TrainSplit.txt", "TestSplit.txt")
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder is such a sequence, or holds some."""
+    """Whether a folder has this layout: a sequence, or several."""
     return any(folder.glob(COLOUR)) or any(folder.glob(f"seq-*/{COLOUR}"))
 
 
 def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     """Read a sequence, or a scene of several.
 
-    A scene is split by its lists of sequences; without them, one frame in five is learned from.
+    A scene is split by its lists of sequences; without them, one frame in five is for training.
 
     Args:
         folder: Holds what the module describes.
         options: `hold_out`, instead of the lists of sequences.
 
     Raises:
-        CaptureError: Something is missing, malformed, or does not fit together.
+        CaptureError: Something is missing, malformed, or inconsistent.
     """
     colour = sorted(folder.glob(COLOUR)) or sorted(folder.glob(f"seq-*/{COLOUR}"))
     if not colour:
@@ -55,7 +55,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     focal = FOCAL_OF_WIDTH * width
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
     poses = np.stack([read_pose(_beside(path, "pose.txt")) for path in colour])
-    kept = [path for path, good in zip(colour, usable_poses(poses), strict=True) if good]
+    usable = [path for path, good in zip(colour, usable_poses(poses), strict=True) if good]
     several = colour[0].parent != folder
     maps = [_beside(path, "depth.png") for path in colour]
     frames = RgbdFrames(
@@ -72,7 +72,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     return rgbd_capture(
         frames,
         lambda count: (
-            _split(folder, kept) or split_by_rule(count, options.hold_out or PUBLISHED_SPLIT)
+            _split(folder, usable) or split_by_rule(count, options.hold_out or PUBLISHED_SPLIT)
         ),
         folder=folder,
         source="7-scenes",
@@ -94,12 +94,12 @@ def _name(path: Path, several: bool) -> str:
 
 
 def _split(folder: Path, paths: list[Path]) -> Split | None:
-    """What the lists of a scene say; None if there are none or they name nothing here."""
-    named = [_sequences(folder / file) for file in SPLITS]
-    if not all(named):
+    """The split by the lists of a scene; None if there are none, or they match no sequence."""
+    listed = [_sequences(folder / file) for file in SPLITS]
+    if not all(listed):
         return None
     number = np.array([int("".join(filter(str.isdigit, path.parent.name)) or -1) for path in paths])
-    train, test = (np.flatnonzero(np.isin(number, sorted(numbers))) for numbers in named)
+    train, test = (np.flatnonzero(np.isin(number, sorted(numbers))) for numbers in listed)
     return Split(train, test) if len(train) else None
 
 

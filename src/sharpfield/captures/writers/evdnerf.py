@@ -1,12 +1,12 @@
-"""Write a capture in the layout of EvDNeRF's data, see `captures.evdnerf`.
+"""Write a capture in the layout of EvDNeRF's data, see `layouts.evdnerf`.
 
-Views to learn from are the training set, the others the validation set. The layout has no place for
-cameras that move or exposures that last, nor for a lens; a capture with these is refused. Its clock
-lasts one second: times are counted from the first frame, and stretched if the last one is not a
-second later. Events outside are left out, and so are depth, flow and other notes.
+Training views are the training set, the others the validation set. The layout cannot store moving
+cameras, exposures that last, or lens distortion; a capture with these is refused. Its clock lasts
+one second: times count from the first frame, and are scaled if the last one is not a second later.
+Events outside are left out, and so are depth, flow and notes.
 
-Raw streams are written as plain arrays (`data_train.npz`), so that nothing need be trusted to read
-them; the published ones are pickled.
+Raw streams are written as plain arrays (`data_train.npz`), which are safe to read; the published
+ones are pickled.
 """
 
 import json
@@ -36,17 +36,17 @@ def write(capture: Capture, folder: Path | str) -> None:
     """Write images, events and poses; the folder appears whole or not at all.
 
     Raises:
-        CaptureError: The folder holds something that is not a capture, or the layout has no place
-            for something essential.
+        CaptureError: The folder holds something that is not a capture, or the layout cannot store
+            something essential.
     """
     folder = Path(folder)
     expect_replaceable(folder, recognise)
     _expect_expressible(capture)
     frames = capture.needed_frames
-    learned = np.unique(frames.track[capture.split.train])
+    train = np.unique(frames.track[capture.split.train])
     sets = {
-        "train": (learned, capture.needed_events),
-        "val": (np.setdiff1d(np.unique(frames.track), learned), capture.test_events),
+        "train": (train, capture.needed_events),
+        "val": (np.setdiff1d(np.unique(frames.track), train), capture.test_events),
     }
     with replacing_folder(folder) as fresh:
         for name, (tracks, events) in sets.items():
@@ -57,7 +57,7 @@ def write(capture: Capture, folder: Path | str) -> None:
 
 
 def _write_views(folder: Path, name: str, capture: Capture, tracks: Int64[np.ndarray, "v"]) -> None:
-    """Images, and the JSON that says when and from where they were taken."""
+    """Write images, and the JSON of their times and poses."""
     frames, camera = capture.needed_frames, capture.camera
     assert isinstance(capture.trajectory, Still), "checked before"
     times = _times_us(capture)
@@ -75,7 +75,7 @@ def _write_views(folder: Path, name: str, capture: Capture, tracks: Int64[np.nda
                 {
                     "file_path": file,
                     "time": since / int(times[-1] - times[0]),
-                    "rotation": math.pi / 10,  # a constant of the published files; nobody reads it
+                    "rotation": math.pi / 10,  # a constant of the published files, unused
                     "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
                 }
             )
@@ -91,7 +91,7 @@ def _write_views(folder: Path, name: str, capture: Capture, tracks: Int64[np.nda
 def _write_events(
     folder: Path, name: str, capture: Capture, events: EventStream, tracks: Int64[np.ndarray, "v"]
 ) -> None:
-    """Sums over the windows between frames, and raw streams."""
+    """Write sums over the windows between frames, and raw streams."""
     times = _times_us(capture)
     within = events.window(int(times[0]), int(times[-1]))
     np.save(folder / f"data_frames_{name}.npy", _sums(capture, within, tracks))
@@ -133,12 +133,12 @@ def _frames_of(capture: Capture, track: int) -> Int64[np.ndarray, "t"]:
 
 
 def _times_us(capture: Capture) -> Int64[np.ndarray, "t"]:
-    """When frames were taken, in every view alike."""
+    """Times of the frames, the same in every view."""
     return np.unique(capture.needed_frames.exposure.open_us)
 
 
 def _expect_expressible(capture: Capture) -> None:
-    """Make sure that the layout has a place for what matters."""
+    """Check that the layout can store what matters."""
     frames, camera = capture.needed_frames, capture.camera
     centred = (camera.cx_px, camera.cy_px) == (camera.width / 2, camera.height / 2)
     times = _times_us(capture)
@@ -160,7 +160,7 @@ def _expect_expressible(capture: Capture) -> None:
     found = [what for what, wrong in problems.items() if wrong]
     if found:
         raise CaptureError(
-            f"EvDNeRF's layout has no place for {found[0]}",
+            f"EvDNeRF's layout cannot store {found[0]}",
             where=capture.name,
             do="write it in our own layout",
         )

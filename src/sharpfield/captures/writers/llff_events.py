@@ -1,10 +1,10 @@
-"""Write a capture in the layout of Ev-DeblurNeRF's data, see `captures.llff_events`.
+"""Write a capture in the layout of Ev-DeblurNeRF's data, see `layouts.llff_events`.
 
 A mono event camera gives the Blender variant (times in ns), a colour one the Color-DAVIS variant
-(times in us, `ev_map.npz`). The layout has no place for lens distortion, a principal point off the
-centre, other than 8-bit RGB images, events of several cameras, or another choice of held-out
-frames; a capture with these is refused. Sparse points and notes but the thresholds are left out,
-and images are numbered anew.
+(times in us, `ev_map.npz`). The layout cannot store lens distortion, a principal point off the
+centre, images other than 8-bit RGB, events of several cameras, or another choice of held-out
+frames; a capture with these is refused. Sparse points and notes are left out, and images are
+renumbered.
 """
 
 from dataclasses import dataclass
@@ -48,8 +48,8 @@ def write(capture: Capture, folder: Path | str) -> None:
     """Write frames, events and trajectory; the folder appears whole or not at all.
 
     Raises:
-        CaptureError: The folder holds something that is not a capture, or the layout has no place
-            for something essential.
+        CaptureError: The folder holds something that is not a capture, or the layout cannot store
+            something essential.
     """
     folder = Path(folder)
     expect_replaceable(folder, recognise)
@@ -203,7 +203,7 @@ def _expect_expressible(capture: Capture, variant: Variant) -> None:
 
 def _not_expressible(what: str, got: object) -> CaptureError:
     return CaptureError(
-        f"the layout of Ev-DeblurNeRF has no place for {what}",
+        f"the layout of Ev-DeblurNeRF cannot store {what}",
         got=got,
         do="write our own layout instead",
     )

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from sharpfield.captures.layouts._photos import depth_bounds, fitted, same_camera
+from sharpfield.captures.layouts._photos import depth_bounds, same_camera, scaled_camera
 from sharpfield.captures.paths.pose_layouts import ExternalPath
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
@@ -207,7 +207,7 @@ def _with_model(capture: Capture, path: ExternalPath) -> Capture:
     camera = capture.camera
     if capture.known.intrinsics == "unknown":
         shared = same_camera(model.cameras, model.names, where=capture.name)
-        camera = fitted(shared, camera.width, camera.height, where=capture.name)
+        camera = scaled_camera(shared, camera.width, camera.height, where=capture.name)
     return replace(
         capture,
         camera=camera,
