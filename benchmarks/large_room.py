@@ -261,7 +261,7 @@ def changes(recipe: str, points: int) -> list[str]:
     return [
         f"cloud.voxel={voxel(points):.5f}",
         "cloud.budget=0",
-        "growth.most=0",
+        "growth.max_points=0",
         "growth.share=0.0001",
         "growth.every=0.5",
         "growth.until=1",

@@ -57,7 +57,7 @@ STUDIES = {
     ),
     "weights": (
         Contender("hybrid"),
-        Contender("hybrid", changes=("quality=even",)),
+        Contender("hybrid", changes=("frame_quality=even",)),
         Contender("room-splat"),
         Contender("room-splat", changes=("sampling.frame_quality=even",)),
     ),

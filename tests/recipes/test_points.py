@@ -19,7 +19,7 @@ from sharpfield.recipes.hybrid import BlurOptions, Hybrid
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.images import SourceOptions, nearest_in_order
-from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions
 from sharpfield.rendering.view import render_view
 from sharpfield.training.checkpoint import file_of
@@ -34,34 +34,42 @@ STEPS = 20
 
 SMALL: dict[str, Any] = dict(
     steps=STEPS,
-    rate=2e-3,
-    points_rate=5e-3,
+    lr=2e-3,
+    points_lr=5e-3,
     cloud=CloudOptions(budget=1200, farthest=float("inf"), colours="fused"),
     sizes=PointSizes(channels=4, width=16, feature=48, octaves=(1, 2, 2)),
-    march=MarchOptions(voxel=0.0, steps=0, asked=8, thickness=1.0, background=0.0),
+    march=MarchOptions(voxel=0.0, steps=0, max_samples=8, thickness=1.0, background=0.0),
     growth=GrowthOptions(every=0.0),
 )
-PIXELS = DrawOptions(patches=96, side=1, border=0, frames=2)
-PATCHES = DrawOptions(patches=6, side=4, apart=(1, 2), border=0, frames=2)
-HERE = SourceOptions(choose="pose", fetch="bilinear", visibility="depth", trust=1.0, prefer=1.0)
+PIXELS = PatchSamplingOptions(patches=96, patch_size=1, border=0, frames=2)
+PATCHES = PatchSamplingOptions(patches=6, patch_size=4, spacing=(1, 2), border=0, frames=2)
+HERE = SourceOptions(
+    selection="pose",
+    interpolation="bilinear",
+    visibility="depth",
+    quality_power=1.0,
+    selection_quality_power=1.0,
+)
 EARLY = replace(SMALL["sizes"], average="early", axes="world", unit=0.0)
 
 RECIPES: dict[str, Callable[[], Any]] = {
-    "points": lambda: PointNeRF(drawn=PIXELS, **SMALL),
+    "points": lambda: PointNeRF(sampling=PIXELS, **SMALL),
     "points, early": lambda: PointNeRF(
-        drawn=PIXELS, **{**SMALL, "sizes": EARLY, "start_colours": True}
+        sampling=PIXELS, **{**SMALL, "sizes": EARLY, "residual_colours": True}
     ),
-    "H": lambda: Hybrid(drawn=PIXELS, blur=BlurOptions(kind="none"), quality="even", **SMALL),
-    "Full": lambda: Hybrid(drawn=PATCHES, **SMALL),
+    "H": lambda: Hybrid(
+        sampling=PIXELS, blur=BlurOptions(kind="none"), frame_quality="even", **SMALL
+    ),
+    "Full": lambda: Hybrid(sampling=PATCHES, **SMALL),
     "learned": lambda: Hybrid(
-        drawn=PATCHES, blur=BlurOptions(kind="learned", size=5), quality="images", **SMALL
+        sampling=PATCHES, blur=BlurOptions(kind="learned", size=5), frame_quality="images", **SMALL
     ),
     "all ours": lambda: Hybrid(
-        drawn=PATCHES,
+        sampling=PATCHES,
         sources=HERE,
         blur=BlurOptions(light="linear"),
-        quality="auto",
-        **{**SMALL, "sizes": EARLY, "start_colours": True},
+        frame_quality="auto",
+        **{**SMALL, "sizes": EARLY, "residual_colours": True},
     ),
 }
 
@@ -90,7 +98,7 @@ def test_a_view_does_not_depend_on_the_chunks(name: str):
 
 
 def test_resuming_equals_never_having_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    growth = GrowthOptions(every=0.2, until=1.0, share=1.0, opaque=0.2, drop=0.2)
+    growth = GrowthOptions(every=0.2, until=1.0, frame_share=1.0, min_opacity=0.2, prune_below=0.2)
     recipe, stop_at = replace(RECIPES["all ours"](), growth=growth), 14
 
     def go(folder: str, *, resume: bool = False) -> bytes:
@@ -123,7 +131,9 @@ def test_points_grow_where_rays_miss_and_fall_out_where_they_are_unsure():
     capture = box()
     recipe = replace(
         RECIPES["points"](),
-        growth=GrowthOptions(every=0.1, until=1.0, share=1.0, opaque=0.1, drop=0.5),
+        growth=GrowthOptions(
+            every=0.1, until=1.0, frame_share=1.0, min_opacity=0.1, prune_below=0.5
+        ),
     )
     model = recipe.build(capture, 0)
     points = model.scene.field.points
@@ -158,7 +168,9 @@ PUBLISHED = {
 
 def test_networks_have_the_published_numbers_of_parameters():
     recipe = Hybrid(
-        cloud=CloudOptions(budget=100), march=SMALL["march"], drawn=replace(PATCHES, side=2)
+        cloud=CloudOptions(budget=100),
+        march=SMALL["march"],
+        sampling=replace(PATCHES, patch_size=2),
     )
     model = recipe.build(box(), 0)
     sizes = {name: count(model.get_submodule(name)) for name in PUBLISHED}
@@ -167,7 +179,7 @@ def test_networks_have_the_published_numbers_of_parameters():
 
 
 def test_a_point_has_42_numbers():
-    model = Hybrid(cloud=CloudOptions(budget=100), drawn=PATCHES, march=SMALL["march"]).build(
+    model = Hybrid(cloud=CloudOptions(budget=100), sampling=PATCHES, march=SMALL["march"]).build(
         box(), 0
     )
     points = model.scene.field.points
@@ -207,7 +219,7 @@ def test_sources_see_what_their_pixels_show_and_nothing_behind_walls():
     frames, source = torch.tensor([frame]), torch.zeros(len(xy), 1, dtype=torch.int64)
     for times, visible in ((1.0, 1.0), (3.0, 0.2)):
         places = (times * seen) @ at[:, :3].T + at[:, 3]
-        shown = sources.show(places, places - at[:, 3], frames, source)
+        shown = sources.project(places, places - at[:, 3], frames, source)
         assert torch.allclose(shown.xy[:, 0], xy, atol=1e-3)
         assert torch.allclose(shown.change, torch.zeros(()), atol=1e-5)
         inside = (xy > 0.01).all(-1)
@@ -219,7 +231,7 @@ def test_sources_see_what_their_pixels_show_and_nothing_behind_walls():
 
 def test_blur_on_single_pixels_is_refused_in_words():
     with pytest.raises(OptionError, match="blur is modelled on patches, and single pixels are"):
-        Hybrid(drawn=PIXELS, **SMALL).build(box(), 0)
+        Hybrid(sampling=PIXELS, **SMALL).build(box(), 0)
 
 
 def test_spacing_is_that_of_a_regular_sheet():

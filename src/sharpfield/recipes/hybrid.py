@@ -1,8 +1,8 @@
-"""Hybrid neural rendering: rooms from blurry video, by neural points and the images around.
+"""Hybrid Neural Rendering: rooms from blurry video, by neural points and image-based rendering.
 
 P. Dai et al., *Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur*, CVPR 2023. Points
-say what is where, the frames nearby what it looks like. Rendered patches are blurred like recorded
-ones before they are compared, and sharp frames count more.
+carry geometry, features of nearby frames carry appearance. Rendered patches are blurred before they
+are compared with recorded ones, and the loss of a frame is weighted by its quality.
 """
 
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ from sharpfield.recipes import point_nerf
 from sharpfield.recipes.point_nerf import PointNeRF
 from sharpfield.recipes.points.hybrid_checkpoint import load_released
 from sharpfield.recipes.points.images import ImageBranch, SourceOptions
-from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import PointScene
 from sharpfield.recipes.settings.presets import Presets
 
@@ -42,11 +42,11 @@ PAPER = Paper(
 }""",
     departures=(
         "Neighbours are the nearest in the window of cells; the released code stops at the first"
-        " layer of cells that holds enough, drops points by chance where a cell is full, and gives"
+        " layer of cells that holds enough, drops points at random where a cell is full, and gives"
         " its first occupied cell no points.",
-        "Descriptors start by chance, and networks by Xavier's rule; the released code starts them"
+        "Descriptors start at random, and networks by Xavier's rule; the released code starts them"
         " from weights trained on another data set for a day. Such a checkpoint can be loaded"
-        " (`released`).",
+        " (`checkpoint`).",
         "Depth of held-out frames is not used unless cloud.frames is `all`, as published.",
         "The regulariser of confidence leaves out empty slots, which the released code fills with"
         " the first point.",
@@ -54,11 +54,11 @@ PAPER = Paper(
         " the momentum of Adam. Nothing restarts when points grow.",
         "Maps of features are read at their own size, which gives the same numbers as enlarging"
         " them first.",
-        "Images do not tell about places behind their camera or a little outside their edge.",
+        "Samples behind the camera of an image, or a little outside of it, are invisible in it.",
         "Rays that miss are left out of a patch before it is blurred; the released code blurs the"
         " background into their neighbours.",
-        "Which patches do without images is drawn anew each step; the released code always takes"
-        " the same slots, whose places in the image are by chance.",
+        "Which patches are rendered without images is random in each step; the released code always"
+        " takes the same slots, whose positions in the image are random.",
         "New points in one round of growth all get the same share of their neighbours' confidence;"
         " in the released code those of earlier frames get powers of it.",
         "Points from depth are voxel means at pixel centres; the released code takes the point"
@@ -69,51 +69,69 @@ PAPER = Paper(
 )
 
 
+RENAMED = {
+    **point_nerf.RENAMED,
+    "sources.choose": "sources.selection",
+    "sources.fetch": "sources.interpolation",
+    "sources.slack": "sources.depth_tolerance",
+    "sources.drop": "sources.dropout",
+    "sources.trust": "sources.quality_power",
+    "sources.prefer": "sources.selection_quality_power",
+    "quality": "frame_quality",
+    "merge": "merge_width",
+    "released": "checkpoint",
+}
+"""Old names of options."""
+
+
 @dataclass(frozen=True)
 class BlurOptions:
-    """How rendered patches are made as blurry as recorded ones. Defaults: Full's for ScanNet."""
+    """Blur of rendered patches. Defaults: the numbers of `Full` for ScanNet."""
 
     kind: Literal["none", "chosen", "learned"] = "chosen"
-    """Not at all (H), by the best of fixed kernels (Full), or by a network."""
+    """`none` (H); `chosen`, the best of fixed kernels for each patch (Full); or a network."""
     size: int = 9
-    """Of kernels, in pixels of a patch; odd."""
+    """Side of the kernels in pixels of a patch; odd."""
     distances: tuple[int, ...] = (1, 2, 4)
-    """How far fixed strokes reach."""
+    """Lengths of the fixed motion kernels from the centre, in pixels of a patch."""
     strokes: Kind = "both"
-    """Which there are: 36 for ScanNet; the paper's rooms have the 12 that go through the pixel."""
+    """Fixed kernels: `both` are the 36 for ScanNet; `through` are the 12 through the pixel that the
+    paper uses for its simulated rooms."""
     edge: Edge = "keep"
-    """What a learned kernel does at the edge of a patch."""
+    """Padding of a learned kernel at the edge of a patch."""
     still_share: Literal["learned", "none"] = "learned"
-    """Whether the network also says how much of a pixel stays where it is."""
+    """Whether the kernel network also predicts the weight of the unblurred pixel."""
     light: Literal["stored", "linear"] = "stored"
-    """What is added up: stored values, as published, or light."""
+    """What is averaged: stored values, as published, or linear light."""
 
 
 def h_only(recipe: "Hybrid") -> "Hybrid":
-    """H of the paper: single pixels, no blur, all frames alike."""
-    drawn = replace(recipe.drawn, patches=3136, side=1)
-    return replace(recipe, drawn=drawn, blur=replace(recipe.blur, kind="none"), quality="even")
+    """H of the paper: single pixels, no blur, equal weights of all frames."""
+    sampling = replace(recipe.sampling, patches=3136, patch_size=1)
+    return replace(
+        recipe, sampling=sampling, blur=replace(recipe.blur, kind="none"), frame_quality="even"
+    )
 
 
 def rooms(recipe: "Hybrid") -> "Hybrid":
-    """Full as the paper has it for simulated rooms: 12 kernels, patches up to 6 pixels apart."""
+    """Full of the paper for simulated rooms: 12 kernels, pixels of a patch up to 6 apart."""
     blur = replace(recipe.blur, strokes="through")
-    return replace(recipe, blur=blur, drawn=replace(recipe.drawn, apart=(1, 6)))
+    return replace(recipe, blur=blur, sampling=replace(recipe.sampling, spacing=(1, 6)))
 
 
 def learned(recipe: "Hybrid") -> "Hybrid":
-    """Full with a kernel learned for each patch."""
+    """Full with a kernel network instead of fixed kernels."""
     return replace(recipe, blur=replace(recipe.blur, kind="learned"))
 
 
 def no_images(recipe: "Hybrid") -> "Hybrid":
-    """The control of the paper: points alone."""
+    """The ablation of the paper without images: points alone."""
     return replace(recipe, sources=replace(recipe.sources, count=0))
 
 
 def draft(recipe: "Hybrid") -> "Hybrid":
-    """Minutes on two CPU cores; sources by pose, what hides them by depth, light adds up."""
-    return replace(_by_pose_and_depth(point_nerf.draft(recipe)), merge=32)
+    """Minutes on two CPU cores; sources by pose, visibility by depth, blur in linear light."""
+    return replace(_by_pose_and_depth(point_nerf.draft(recipe)), merge_width=32)
 
 
 def standard(recipe: "Hybrid") -> "Hybrid":
@@ -122,56 +140,59 @@ def standard(recipe: "Hybrid") -> "Hybrid":
 
 
 def _by_pose_and_depth(recipe: "Hybrid") -> "Hybrid":
-    """Images chosen and seen through by what poses and depth tell."""
+    """Source images selected by pose, visibility by measured depth."""
     sources = replace(
         recipe.sources,
-        choose="pose",
-        fetch="bilinear",
+        selection="pose",
+        interpolation="bilinear",
         visibility="depth",
-        trust=1.0,
-        prefer=1.0,
+        quality_power=1.0,
+        selection_quality_power=1.0,
     )
-    judged = recipe.quality if recipe.quality == "even" else "auto"
+    judged = recipe.frame_quality if recipe.frame_quality == "even" else "auto"
     return replace(
-        recipe, sources=sources, quality=judged, blur=replace(recipe.blur, light="linear")
+        recipe, sources=sources, frame_quality=judged, blur=replace(recipe.blur, light="linear")
     )
 
 
 @dataclass(frozen=True)
 class Hybrid(PointNeRF):
-    """Neural points and features of nearby images to a scene, from blurry video with depth."""
+    """Neural points with features of nearby images, from blurry video with depth."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = RENAMED
     presets: ClassVar[Presets] = Presets(
         variants={"h-only": h_only, "rooms": rooms, "learned": learned, "no-images": no_images},
         sizes={"draft": draft, "standard": standard, "paper": point_nerf.published},
         renamed={"no-pictures": "no-images"},
     )
 
-    drawn: DrawOptions = field(default_factory=lambda: DrawOptions(patches=49, side=8))
+    sampling: PatchSamplingOptions = field(
+        default_factory=lambda: PatchSamplingOptions(patches=49, patch_size=8)
+    )
     sources: SourceOptions = field(default_factory=SourceOptions)
     blur: BlurOptions = field(default_factory=BlurOptions)
-    quality: Literal["even"] | Judge = "published"
-    """How much each frame counts: all alike; as published; by events where there are any; by how
-    sharp frames look; by events."""
-    merge: int = 64
-    """Width of the network that weighs images."""
-    released: str = ""
-    """A checkpoint of the released code to start from: its `*_net_ray_marching.pth`."""
+    frame_quality: Literal["even"] | Judge = "published"
+    """Weight of the loss of each frame: `even`; `published`, the paper's score; `auto`, by events
+    where there are any; `images`, by sharpness; `events`."""
+    merge_width: int = 64
+    """Width of the network that weights source images."""
+    checkpoint: str = ""
+    """Path of a checkpoint of the released code to start from: its `*_net_ray_marching.pth`."""
 
     def build(self, capture: Capture, seed: int) -> PointModel:
         """The recipe on one capture.
 
         Raises:
-            OptionError: Blur is modelled on single pixels.
+            OptionError: Blur is asked for, and patches are single pixels.
         """
-        if self.blur.kind != "none" and self.drawn.side < 2:
+        if self.blur.kind != "none" and self.sampling.patch_size < 2:
             raise OptionError(
-                "blur is modelled on patches, and single pixels are drawn",
-                got=f"blur.kind {self.blur.kind}, drawn.side {self.drawn.side}",
-                do="set drawn.side to 8, or blur.kind to none",
+                "blur needs patches, and single pixels are sampled",
+                got=f"blur.kind {self.blur.kind}, sampling.patch_size {self.sampling.patch_size}",
+                do="set sampling.patch_size to 8, or blur.kind to none",
             )
-        weight = quality_of(capture, self.quality)
+        weight = quality_weights(capture, self.frame_quality)
         scene = PointScene(self.cloud, self.sizes, self.march, capture, seed, weight=weight)
         images = None
         if self.sources.count > 0:
@@ -182,7 +203,7 @@ class Hybrid(PointNeRF):
                 seed,
                 radius=scene.field.radius,
                 quality=weight,
-                width=self.merge,
+                width=self.merge_width,
             )
         model = PointModel(
             self,
@@ -194,8 +215,8 @@ class Hybrid(PointNeRF):
             light=self.blur.light,
             weight=weight,
         )
-        if self.released:
-            load_released(Path(self.released), scene.field, model.head, images, model.blur)
+        if self.checkpoint:
+            load_released(Path(self.checkpoint), scene.field, model.head, images, model.blur)
         return model
 
     def _blur(self, seed: int) -> ChosenKernel | LearnedKernel | None:
@@ -205,7 +226,7 @@ class Hybrid(PointNeRF):
         if blur.kind == "chosen":
             return ChosenKernel(motion_kernels(blur.size, blur.distances, kind=blur.strokes))
         return LearnedKernel(
-            self.drawn.side,
+            self.sampling.patch_size,
             seed=seed,
             size=blur.size,
             edge=blur.edge,
@@ -213,8 +234,8 @@ class Hybrid(PointNeRF):
         )
 
 
-def quality_of(capture: Capture, kind: Literal["even"] | Judge) -> Float[np.ndarray, "n"]:
-    """How much each frame counts, one on average; frames that are held out count one."""
+def quality_weights(capture: Capture, kind: Literal["even"] | Judge) -> Float[np.ndarray, "n"]:
+    """Weight of the loss of each frame, one on average; held-out frames have one."""
     if kind == "even":
         return np.ones(len(capture.needed_frames))
     weight = frame_weights(capture, kind)

@@ -1,7 +1,7 @@
-"""Point-NeRF: a sharp scene from neural points, blur and all. The baseline of `hybrid`.
+"""Point-NeRF: a radiance field on neural points, of frames taken as sharp; baseline of `hybrid`.
 
 Q. Xu et al., *Point-NeRF: Point-based Neural Radiance Fields*, CVPR 2022. Points from depth carry
-learned descriptors; the few around a place on a ray tell its density and colour.
+learned descriptors; the nearest ones around a sample on a ray give its density and colour.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,7 +12,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.fields.points.networks import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.recipes.points.growth import GrowthOptions
-from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions, PointScene
 from sharpfield.recipes.settings.presets import Presets
 
@@ -30,8 +30,8 @@ PAPER = Paper(
 }""",
     departures=(
         "Neighbours are the nearest in the window of cells; the released code stops at the first"
-        " layer of cells that holds enough, and drops points by chance where a cell is full.",
-        "Descriptors start by chance; the released code starts them, and the networks, from"
+        " layer of cells that holds enough, and drops points at random where a cell is full.",
+        "Descriptors start at random; the released code starts them, and the networks, from"
         " weights trained on another data set for a day.",
         "The regulariser of confidence leaves out empty slots, which the released code fills with"
         " the first point.",
@@ -42,19 +42,36 @@ PAPER = Paper(
 )
 
 
+RENAMED = {
+    "rate": "lr",
+    "points_rate": "points_lr",
+    "decay": "lr_final",
+    "decisive": "confidence_weight",
+    "start_colours": "residual_colours",
+    "drawn.side": "sampling.patch_size",
+    "drawn.apart": "sampling.spacing",
+    "drawn": "sampling",
+    "march.asked": "march.max_samples",
+    "growth.share": "growth.frame_share",
+    "growth.opaque": "growth.min_opacity",
+    "growth.drop": "growth.prune_below",
+    "growth.most": "growth.max_points",
+}
+"""Old names of options."""
+
 P = TypeVar("P", bound="PointNeRF")
 
 
 def draft(recipe: P) -> P:
-    """Minutes on two CPU cores: small networks on averaged neighbours, and first colours."""
-    recipe = quick(recipe, points=50_000, width=64, feature=64, pixels=1024, asked=12)
-    return replace(recipe.lasting(2000), rate=2e-3, points_rate=5e-3, decay=0.05)
+    """Minutes on two CPU cores: small networks on averaged neighbours, residual colours."""
+    recipe = quick(recipe, points=50_000, width=64, feature=64, pixels=1024, samples=12)
+    return replace(recipe.lasting(2000), lr=2e-3, points_lr=5e-3, lr_final=0.05)
 
 
 def standard(recipe: P) -> P:
     """Minutes on a GPU, hours on a CPU."""
-    recipe = quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, asked=16)
-    return replace(recipe.lasting(20_000), rate=1e-3, points_rate=4e-3, decay=0.05)
+    recipe = quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, samples=16)
+    return replace(recipe.lasting(20_000), lr=1e-3, points_lr=4e-3, lr_final=0.05)
 
 
 def published(recipe: P) -> P:
@@ -62,20 +79,20 @@ def published(recipe: P) -> P:
     return recipe
 
 
-def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, asked: int) -> P:
-    """What needs no weights of another data set to learn fast."""
-    whole = recipe.drawn.side**2
-    drawn = DrawOptions(
-        patches=max(pixels // whole, 1),
-        side=recipe.drawn.side,
-        apart=(1, 3),
+def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, samples: int) -> P:
+    """Settings that learn fast without weights pre-trained on another data set."""
+    patch_pixels = recipe.sampling.patch_size**2
+    sampling = PatchSamplingOptions(
+        patches=max(pixels // patch_pixels, 1),
+        patch_size=recipe.sampling.patch_size,
+        spacing=(1, 3),
         frames=8,
         border=0,
     )
     return replace(
         recipe,
-        start_colours=True,
-        drawn=drawn,
+        residual_colours=True,
+        sampling=sampling,
         cloud=CloudOptions(
             budget=points, colours="fused", nearest=0.0, farthest=float("inf"), frames="train"
         ),
@@ -88,33 +105,35 @@ def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, aske
             average="early",
             unit=0.0,
         ),
-        march=MarchOptions(voxel=0.0, steps=0, asked=asked, thickness=1.0, background=0.5),
-        growth=GrowthOptions(every=0.1, until=0.5, most=2 * points),
+        march=MarchOptions(voxel=0.0, steps=0, max_samples=samples, thickness=1.0, background=0.5),
+        growth=GrowthOptions(every=0.1, until=0.5, max_points=2 * points),
     )
 
 
 @dataclass(frozen=True)
 class PointNeRF:
-    """Neural points from depth to a scene, blur and all."""
+    """Neural points from depth; frames are taken as sharp. The baseline of `hybrid`."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = RENAMED
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}
     )
 
     steps: int = 200_000
-    """Length of the schedule."""
-    rate: float = 5e-4
-    """First learning rate of networks."""
-    points_rate: float = 2e-3
-    """First learning rate of points."""
-    decay: float = 0.63
-    """What is left of the rates at the end."""
-    decisive: float = 1e-4
-    """Weight of the term that makes confidences 0 or 1."""
-    start_colours: bool = False
-    """The network adds to colours that points and images have, instead of making its own."""
-    drawn: DrawOptions = field(default_factory=DrawOptions)
+    """Length of the schedule in steps."""
+    lr: float = 5e-4
+    """First learning rate of the networks (Adam)."""
+    points_lr: float = 2e-3
+    """First learning rate of the descriptors, colours and confidences of points."""
+    lr_final: float = 0.63
+    """Learning rates at the end of the schedule, as a fraction of the first ones."""
+    confidence_weight: float = 1e-4
+    """Weight of the regulariser that drives confidences to 0 or 1."""
+    residual_colours: bool = False
+    """Whether the network predicts a residual of the colours of points and images, instead of the
+    colour itself."""
+    sampling: PatchSamplingOptions = field(default_factory=PatchSamplingOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     sizes: PointSizes = field(default_factory=PointSizes)
     march: MarchOptions = field(default_factory=MarchOptions)

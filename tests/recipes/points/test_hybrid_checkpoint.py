@@ -13,7 +13,7 @@ from sharpfield.core.errors import RunError
 from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.recipes.hybrid import BlurOptions, Hybrid
 from sharpfield.recipes.points.hybrid_checkpoint import read_released
-from sharpfield.recipes.points.model import DrawOptions, PointModel
+from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from tests.recipes.box import box
 
 COUNT = 321
@@ -58,11 +58,11 @@ def released() -> dict[str, Tensor]:
 
 def published(path: Path) -> Hybrid:
     return Hybrid(
-        drawn=DrawOptions(patches=2, side=8, border=0, apart=(1, 1)),
+        sampling=PatchSamplingOptions(patches=2, patch_size=8, border=0, spacing=(1, 1)),
         cloud=CloudOptions(budget=200),
         blur=BlurOptions(kind="learned"),
-        quality="even",
-        released=str(path),
+        frame_quality="even",
+        checkpoint=str(path),
     )
 
 

@@ -1,8 +1,8 @@
-"""Neural points become more where images show a surface that no point is near, and fewer.
+"""Growing and pruning of neural points.
 
-A ray that *missed* came near no point, though its pixel differs from the background. Beside such
-pixels there are rays that hit; where one of them is stopped by a single place, a point is added
-there, with what the points around it know. So surfaces grow at their edges, round after round.
+A ray *misses* if no point is near it although its pixel differs from the background. Where a ray
+beside such a pixel has a single opaque sample, a point is added found, with the mean descriptor of
+its neighbours. So surfaces grow at their edges, round after round.
 
 Source: Point-NeRF (CVPR 2022), section 4.3; numbers from the released code of Hybrid Neural
 Rendering.
@@ -24,45 +24,46 @@ from sharpfield.geometry.rays import cast
 from sharpfield.recipes.points.scene import PointScene
 
 DIFFERENT = 0.002
-"""A pixel that is closer to the background may as well show it."""
+"""Difference from the background, below which a pixel may show the background."""
 
 CHUNK = 4096
-"""Rays looked at at once."""
+"""Rays rendered at once."""
 
 CANDIDATES = 4
-"""Frames that are searched for misses, for each that is then looked at closely."""
+"""Frames rendered coarsely, for each frame that points are grown from."""
 
 STRIDE = 4
-"""Pixels between the rays of that search."""
+"""Distance in pixels of the rays of the coarse search."""
 
 
 @dataclass(frozen=True)
 class GrowthOptions:
-    """When points are added and dropped. Defaults: Hybrid Neural Rendering's for ScanNet."""
+    """When points are grown and pruned. Defaults: Hybrid Neural Rendering's for ScanNet."""
 
     every: float = 0.05
-    """Part of the schedule between two rounds; 0 for none."""
+    """Fraction of the schedule between two rounds; 0 for no rounds."""
     until: float = 0.6
-    """Part of the schedule after which their number stays."""
-    share: float = 0.01
-    """Of the training frames, those with most misses are looked at in a round; at least one."""
-    opaque: float = 0.7
-    """Least opacity of a single place for a point to be added there; above 1 none is."""
+    """Fraction of the schedule after which no points are grown or pruned."""
+    frame_share: float = 0.01
+    """Fraction of the training frames, those with most misses, that grow points in a round; at
+    least one frame."""
+    min_opacity: float = 0.7
+    """Least opacity of a sample at which a point is added; above 1 none is added."""
     confidence: float = 0.4
-    """Of a new point, relative to those around it."""
-    drop: float = 0.0
-    """Points less sure than this are dropped; 0 keeps all, as published for rooms."""
-    most: int = 0
-    """Points there may be; 0 for any number."""
+    """Confidence of a new point, relative to its neighbours."""
+    prune_below: float = 0.0
+    """Points of a lower confidence are pruned; 0 prunes none, as published for rooms."""
+    max_points: int = 0
+    """Maximum number of points; 0 for no maximum."""
 
     @property
     def grows(self) -> bool:
         """Whether points may be added."""
-        return self.opaque <= 1
+        return self.min_opacity <= 1
 
     def due(self, step: int, steps: int) -> bool:
         """Whether there is a round after this step."""
-        if self.every <= 0 or not (self.grows or self.drop > 0):
+        if self.every <= 0 or not (self.grows or self.prune_below > 0):
             return False
         every = max(round(self.every * steps), 1)
         return (step + 1) % every == 0 and step + 1 <= self.until * steps
@@ -70,9 +71,9 @@ class GrowthOptions:
 
 @dataclass(frozen=True)
 class Added:
-    """Places for new points, and the rows and shares of those around each."""
+    """Positions of new points, and the rows and weights of the neighbours of each."""
 
-    place: Float[Tensor, "m 3"]
+    position: Float[Tensor, "m 3"]
     rows: Tensor
     share: Tensor
 
@@ -81,36 +82,36 @@ class Added:
 def missing_points(
     options: GrowthOptions, scene: PointScene, pinhole: Pinhole, step: int
 ) -> Added | None:
-    """Places at the edges of what rays miss; None if there are none."""
+    """New points at the edges of what rays miss; None if there are none."""
     train = scene.capture.split.train
-    count = max(round(options.share * len(train)), 1)
+    count = max(round(options.frame_share * len(train)), 1)
     random = numpy_generator(scene.seed, step, "growth")
     drawn = random.permutation(train)[: CANDIDATES * count]
     missed = [_missed(scene, pinhole, int(frame)) for frame in drawn]
     worst = drawn[np.argsort(missed, kind="stable")[::-1][:count]]
-    places = [_edge(options, scene, pinhole, int(frame)) for frame in worst]
-    place = torch.cat(places)
-    rows, way = scene.field.neighbours(place)
-    there = rows[:, 0] >= 0
-    if not there.any():
+    positions = [_edge(options, scene, pinhole, int(frame)) for frame in worst]
+    position = torch.cat(positions)
+    rows, way = scene.field.neighbours(position)
+    found = rows[:, 0] >= 0
+    if not found.any():
         return None
-    rows, way = rows[there], way[there]
-    return Added(place[there], rows, shares(way, rows >= 0))
+    rows, way = rows[found], way[found]
+    return Added(position[found], rows, shares(way, rows >= 0))
 
 
 def grown(
     options: GrowthOptions, points: NeuralPoints, added: Added | None, step: int, steps: int
 ) -> Growth | None:
-    """The points with new ones after them, and without those that are unsure."""
+    """The points without those that are pruned, then the new ones."""
     old = points.points()
     sure = torch.ones(len(points), dtype=torch.bool, device=points.positions.device)
-    if options.drop > 0:
-        sure = points.confidence.detach()[:, 0] >= options.drop
+    if options.prune_below > 0:
+        sure = points.confidence.detach()[:, 0] >= options.prune_below
     stay = torch.nonzero(sure)[:, 0]
-    room = max(options.most - len(stay), 0) if options.most else None
+    room = max(options.max_points - len(stay), 0) if options.max_points else None
     if added is not None and room is not None:
-        added = Added(added.place[:room], added.rows[:room], added.share[:room])
-    if added is None or not len(added.place):
+        added = Added(added.position[:room], added.rows[:room], added.share[:room])
+    if added is None or not len(added.position):
         if sure.all():
             return None
         return Growth(stay, torch.zeros_like(stay, dtype=torch.bool))
@@ -121,7 +122,7 @@ def grown(
     values: dict[str, Tensor] = {}
     for name, held in old.items():
         held = held.detach()
-        new = added.place if name == "positions" else (share[:, None] @ held[rows])[:, 0]
+        new = added.position if name == "positions" else (share[:, None] @ held[rows])[:, 0]
         if name == "confidence":
             new = options.confidence * new
         values[name] = torch.cat([held[stay], new])
@@ -131,8 +132,8 @@ def grown(
 
 
 def _missed(scene: PointScene, pinhole: Pinhole, frame: int) -> float:
-    """How wrong the background is where rays miss, summed over a coarse grid."""
-    stored, hit = _looked(scene, pinhole, frame, STRIDE)[:2]
+    """Squared error of the background where rays miss, summed over a coarse grid."""
+    stored, hit = _rendered(scene, pinhole, frame, STRIDE)[:2]
     error = (stored - scene.march.background).square().mean(-1)
     return float((error * ~hit).sum())
 
@@ -140,21 +141,21 @@ def _missed(scene: PointScene, pinhole: Pinhole, frame: int) -> float:
 def _edge(
     options: GrowthOptions, scene: PointScene, pinhole: Pinhole, frame: int
 ) -> Float[Tensor, "m 3"]:
-    """Opaque places on rays beside those that miss something."""
-    stored, hit, densest, where = _looked(scene, pinhole, frame, 1)
+    """Opaque samples on rays beside those that miss."""
+    stored, hit, densest, where = _rendered(scene, pinhole, frame, 1)
     shown = (stored - scene.march.background).norm(dim=-1) > DIFFERENT
     missed = (~hit & shown).float()[None, None]
     beside = torch.nn.functional.max_pool2d(missed, 3, stride=1, padding=1)[0, 0] > 0
-    chosen = beside & hit & (densest > options.opaque)
+    chosen = beside & hit & (densest > options.min_opacity)
     return where[chosen]
 
 
-def _looked(
+def _rendered(
     scene: PointScene, pinhole: Pinhole, frame: int, stride: int
 ) -> tuple[
     Float[Tensor, "h w c"], Bool[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w 3"]
 ]:
-    """A frame as stored, which of its rays hit, and the densest place on each."""
+    """A frame as stored, which of its rays hit, and the densest sample on each."""
     frames = scene.capture.needed_frames
     image: Float32[np.ndarray, "h w c"] = np.asarray(frames.images[frame])[::stride, ::stride]
     stored = torch.from_numpy(image.astype(np.float32) / np.float32(frames.white))

@@ -1,8 +1,8 @@
-"""Checkpoints of the released code of Hybrid Neural Rendering, read as what they are: tensors.
+"""Checkpoints of the released code of Hybrid Neural Rendering, read as tensors only.
 
 A `*_net_ray_marching.pth` holds the points (`neural_points.*`) and the networks (`aggregator.*`).
 It is opened without running anything it may contain. A head that the code keeps but never uses
-(`color_branch`) is passed over; the network of learned kernels is there only if it was trained.
+(`color_branch`) is ignored; the network of learned kernels is there only if it was trained.
 """
 
 import pickle
@@ -26,7 +26,7 @@ POINTS = {
     "colours": "points_color",
     "directions": "points_dir",
 }
-"""Ours, and theirs under `neural_points.`, spelled as they are."""
+"""Our names, and theirs under `neural_points.`, spelled as released."""
 
 STAGES = ("aux_block_s1", "aux_block_s2", "aux_block_s3")
 
@@ -72,14 +72,14 @@ def load_released(
     images: ImageBranch | None,
     blur: ChosenKernel | LearnedKernel | None,
 ) -> None:
-    """Give points and networks the values of a released checkpoint, and as many points.
+    """Load a released checkpoint into points and networks.
 
     Args:
-        path: Of the file.
+        path: Path of the checkpoint.
         field: Its points become those of the checkpoint.
-        head: Makes colours.
-        images: Networks that read images; left alone if None.
-        blur: Gets its network if it has one and the checkpoint, too.
+        head: Colour head.
+        images: Image branch, if there is one.
+        blur: Gets the kernel network, if both have one.
 
     Raises:
         RunError: The file is no such checkpoint, or the networks have other sizes.

@@ -1,11 +1,10 @@
-"""The image branch: what the training frames show of places on rays, joined with the points' own.
+"""The image branch: features of nearby training frames, fused with those of the neural points.
 
-In training some rays must do *without* images, so that points learn to stand alone; what the
-images add then varies less from view to view.
+Every sample on a ray is projected into a few *source* frames, whose features are weighted by a
+network and mixed with the feature of the points. In training a part of the rays does without images
+(dropout), so that points learn to stand alone; what images add then varies less between views.
 
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.1.
-
-Which images tell about places on a ray, and where in them: sources, projection, visibility.
 """
 
 from dataclasses import dataclass
@@ -23,10 +22,10 @@ from sharpfield.fields.image_features import MAPS, FeatureExtractor, Merging, Mi
 from sharpfield.ops.pyramid import look_up
 from sharpfield.rendering.points import Asked
 
-AHEAD = 1e-6
-"""Least depth of what a image shows."""
+MIN_DEPTH = 1e-6
+"""Least depth of a sample in a source image."""
 
-APART = 0.25
+BASELINE = 0.25
 """Cameras this share of the largest depth apart count as looking in orthogonal directions."""
 
 EQUAL = 0.02
@@ -35,38 +34,39 @@ EQUAL = 0.02
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Images beside the points. Defaults: Hybrid Neural Rendering's."""
+    """Source images. Defaults: Hybrid Neural Rendering's."""
 
     count: int = 4
-    """Asked about each place; 0 for none."""
-    choose: Literal["order", "pose"] = "order"
-    """Those nearest in the order of frames, as published, or those whose cameras stand near and
-    look along a ray."""
-    fetch: Literal["nearest", "bilinear"] = "nearest"
-    """Whole pixels, as published, or between them."""
+    """Source images of each sample; 0 turns the image branch off."""
+    selection: Literal["order", "pose"] = "order"
+    """Selection of source images: `order` takes the nearest in the order of frames, as published;
+    `pose` those whose cameras are near and look along the ray."""
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
+    """Interpolation of source images: nearest pixel, as published, or bilinear."""
     visibility: Literal["none", "depth"] = "none"
-    """Whether what a image does not show is told by its network alone, as published, or by
-    depth."""
-    slack: float = 1.0
-    """How far behind the measured depth a place still counts as visible, in radii of neighbours."""
-    drop: float = 0.5
-    """Share of the rays that must do without images in training."""
-    trust: float = 0.0
-    """Power of a image's quality that its weight is multiplied by; 0 as published."""
-    prefer: float = 0.0
-    """Power of a image's quality when sources are chosen by pose."""
+    """Visibility of a sample in a source image: left to the network (`none`), as published, or by
+    measured depth."""
+    depth_tolerance: float = 1.0
+    """Distance behind the measured depth at which a sample still counts as visible, in radii of
+    neighbours."""
+    dropout: float = 0.5
+    """Fraction of the rays that are rendered without images in training."""
+    quality_power: float = 0.0
+    """Exponent of the quality of a source image in its weight; 0 as published."""
+    selection_quality_power: float = 0.0
+    """Exponent of the quality of a source image in the selection by pose."""
 
 
 @dataclass(frozen=True)
-class Shown:
-    """Where places are in their sources."""
+class Projection:
+    """Projections of samples into their source images."""
 
     source: Int64[Tensor, "n v"]
     """Number in the list of images that were prepared."""
     xy: Float[Tensor, "n v 2"]
     """In pixels."""
     change: Float[Tensor, "n v 3"]
-    """Unit direction from the source to the place, minus that of the ray."""
+    """Unit direction from the source camera to the sample, minus that of the ray."""
     visible: Float[Tensor, "n v"]
     """0...1; 0 outside of the image and behind the camera."""
 
@@ -75,10 +75,10 @@ class ImageSources(nn.Module):
     """The training frames of a capture as sources.
 
     Args:
-        options: Which of them, and how they are read.
+        options: Selection and interpolation.
         capture: With frames.
-        radius: Of neighbours of a place.
-        quality: Of every frame; one on average.
+        radius: Radius of the neighbours of a sample, in world units.
+        quality: Quality of every frame; one on average.
     """
 
     poses: Tensor
@@ -117,21 +117,24 @@ class ImageSources(nn.Module):
         *,
         exclude: bool,
     ) -> Int64[Tensor, "b v"]:
-        """The frames that tell about rays, best first.
+        """The source frames of rays, best first.
 
         Args:
-            frame: That rays belong to, or are nearest to in time.
-            origin: Of rays.
-            direction: Unit length.
-            exclude: Whether a ray's own frame may not tell, as while training. By order it never
-                does.
+            frame: Frame of each ray, or the one nearest in time.
+            origin: Origins of the rays.
+            direction: Unit directions of the rays.
+            exclude: Whether to leave out the frame of the ray itself, as in training. Selection by
+                order always does.
         """
-        if self.options.choose == "order":
+        if self.options.selection == "order":
             return self.by_order[frame]
         pose = self.poses[self.learned]
-        apart = torch.cdist(origin, pose[:, :, 3]) / (APART * self.capture.far)
+        apart = torch.cdist(origin, pose[:, :, 3]) / (BASELINE * self.capture.far)
         score = apart + 1 - direction @ pose[:, :, 2].T + EQUAL
-        score = score / self.quality[self.learned].clamp_min(1e-3) ** self.options.prefer
+        score = (
+            score
+            / self.quality[self.learned].clamp_min(1e-3) ** self.options.selection_quality_power
+        )
         if exclude:
             score = torch.where(self.learned == frame[:, None], torch.inf, score)
         count = min(self.options.count, len(self.learned) - 1)
@@ -143,46 +146,46 @@ class ImageSources(nn.Module):
         stored = torch.from_numpy(np.stack(held).astype(np.float32) / np.float32(self.white))
         return stored.to(self.poses.device)
 
-    def show(
+    def project(
         self,
-        places: Float[Tensor, "n 3"],
+        positions: Float[Tensor, "n 3"],
         direction: Float[Tensor, "n 3"],
         frames: Int64[Tensor, "u"],
         source: Int64[Tensor, "n v"],
-    ) -> Shown:
-        """Where places are in their sources.
+    ) -> Projection:
+        """Project samples into their source images.
 
         Args:
-            places: In the world.
-            direction: Of the ray each is on.
+            positions: Positions of the samples in the world.
+            direction: Directions of their rays.
             frames: The images that were prepared.
-            source: Number of each place's sources in that list.
+            source: Sources of each sample, as numbers in that list.
         """
         pose = self.poses[frames][source]  # [n, v, 3, 4]
-        way = places[:, None] - pose[..., 3]
+        way = positions[:, None] - pose[..., 3]
         seen = (way[..., None] * pose[..., :3]).sum(-2)  # R^T way; a product of matrices is slower
-        ahead = seen[..., 2] > AHEAD
+        ahead = seen[..., 2] > MIN_DEPTH
         safe = torch.where(ahead[..., None], seen, seen.new_tensor([0.0, 0.0, 1.0]))
         camera = self.capture.camera
         xy = camera.project(safe)
         inside = ahead & ((xy >= 0) & (xy < xy.new_tensor(camera.size))).all(-1)
         visible = inside.float()
         if self.depth is not None:
-            visible = visible * self._uncovered(safe, frames, source, inside)
-        if self.options.trust:
-            visible = visible * self.quality[frames][source] ** self.options.trust
+            visible = visible * self._unoccluded(safe, frames, source, inside)
+        if self.options.quality_power:
+            visible = visible * self.quality[frames][source] ** self.options.quality_power
         unit = torch.nn.functional.normalize(direction, dim=-1)[:, None]
         change = torch.nn.functional.normalize(way, dim=-1) - unit
-        return Shown(source, xy, change, visible)
+        return Projection(source, xy, change, visible)
 
-    def _uncovered(
+    def _unoccluded(
         self,
         seen: Float[Tensor, "n v 3"],
         frames: Int64[Tensor, "u"],
         source: Int64[Tensor, "n v"],
         inside: Bool[Tensor, "n v"],
     ) -> Float[Tensor, "n v"]:
-        """One where a place is not behind what the depth camera measured, falling to zero."""
+        """One where a sample is not behind the measured depth, falling to zero behind it."""
         assert self.depth is not None
         maps = np.stack([self.depth.at(i) for i in frames.tolist()])
         measured = torch.from_numpy(maps).to(seen.device)
@@ -191,7 +194,7 @@ class ImageSources(nn.Module):
         within = inside & ((xy >= 0) & (xy < size)).all(-1)
         x, y = torch.where(within[..., None], xy, 0).long().unbind(-1)
         there = measured[source, y, x]
-        slack = self.options.slack * self.radius
+        slack = self.options.depth_tolerance * self.radius
         behind = (seen[..., 2] - there - slack).clamp_min(0) / slack
         return torch.where(within & (there > 0), torch.exp(-behind), 1.0)
 
@@ -199,12 +202,12 @@ class ImageSources(nn.Module):
 def nearest_in_order(
     frames: int, train: Int64[np.ndarray, "a"], count: int
 ) -> Int64[np.ndarray, "n v"]:
-    """For every frame the training frames nearest in order, itself left out; earlier ones first.
+    """The training frames nearest in order to every frame, without itself; earlier ones first.
 
     Args:
-        frames: How many there are.
-        train: Those that are learned from.
-        count: Wanted; fewer if there are not so many.
+        frames: Number of frames.
+        train: Training frames.
+        count: Number wanted; fewer if there are not so many.
     """
     away = np.abs(np.arange(frames)[:, None] - train).astype(np.float64)
     away[away == 0] = np.inf
@@ -223,20 +226,20 @@ class Prepared:
     levels: list[Float[Tensor, "u _h _w _f"]]
     """The images and their maps."""
     alone: Bool[Tensor, "b"]
-    """Rays that do without."""
+    """Rays that are rendered without images."""
 
 
 class ImageBranch(nn.Module):
-    """Sources, the networks that read them, and those that join them with points.
+    """Source images, the networks that read them, and the network that fuses them with points.
 
     Args:
-        options: Which images, and how they are read.
+        options: Selection and interpolation of source images.
         capture: With frames.
-        feature: Width of the feature of a place.
-        seed: Of the run.
-        radius: Of neighbours of a place.
-        quality: Of every frame; one on average.
-        width: Of the network that weighs sources.
+        feature: Width of the feature of a sample.
+        seed: Random seed of the run.
+        radius: Radius of the neighbours of a sample, in world units.
+        quality: Quality of every frame; one on average.
+        width: Width of the network that weights sources.
     """
 
     def __init__(
@@ -262,13 +265,13 @@ class ImageBranch(nn.Module):
     def prepare(
         self, rays: Rays, frame: Int64[Tensor, "b"], alone: Bool[Tensor, "b"], *, learning: bool
     ) -> Prepared:
-        """Choose sources for rays and read their images.
+        """Select the sources of rays and extract their features.
 
         Args:
             rays: On one leading axis.
-            frame: That each belongs to, or is nearest to.
-            alone: Rays that do without images.
-            learning: Whether a ray's own frame must not tell.
+            frame: Frame of each ray, or the one nearest in time.
+            alone: Rays that are rendered without images.
+            learning: Leave out the frame of the ray itself.
         """
         chosen = self.sources.of_rays(frame, rays.origin, rays.direction, exclude=learning)
         frames, source = torch.unique(chosen, return_inverse=True)
@@ -278,23 +281,27 @@ class ImageBranch(nn.Module):
     def forward(
         self, feature: Float[Tensor, "n r"], asked: Asked, ready: Prepared
     ) -> tuple[Float[Tensor, "n r"], Float[Tensor, "n c"], Float[Tensor, "n 1"]]:
-        """Features that know what images show, and what images say of the colour itself.
+        """Fuse the features of points with those of the source images.
 
         Args:
-            feature: Of the places, from points.
-            asked: The places.
-            ready: Images of their rays.
+            feature: Features of the samples, from points.
+            asked: The samples.
+            ready: Source images of their rays.
 
         Returns:
             Mixed features; sum of the sources' colours by weight; sum of these weights.
         """
         source = ready.source[asked.ray]
-        shown = self.sources.show(asked.place, asked.direction, ready.frames, source)
-        xy = shown.xy.floor() + 0.5 if self.options.fetch == "nearest" else shown.xy
+        projection = self.sources.project(asked.place, asked.direction, ready.frames, source)
+        xy = (
+            projection.xy.floor() + 0.5
+            if self.options.interpolation == "nearest"
+            else projection.xy
+        )
         looked = look_up(xy.flatten(0, 1), source.flatten(), ready.levels)
         looked = looked.view(*source.shape, looked.shape[-1])
         with_images = ~ready.alone[asked.ray][:, None]
-        merged, weight = self.merging(looked, feature, shown.change, shown.visible)
+        merged, weight = self.merging(looked, feature, projection.change, projection.visible)
         weight = weight * with_images
         mixed = self.mixing(feature, merged * with_images)
         light = (weight[..., None] * looked[..., : self.colours]).sum(1)

@@ -1,14 +1,14 @@
 """The model of recipes on neural points: a scene and, where a recipe has them, images and blur.
 
-A step looks at patches of a few frames; patches of one pixel are pixels. The colour of a place
-comes from its points, and from images if there is a branch for them.
+A batch holds patches of a few frames; patches of one pixel are pixels. The colour of a sample on a
+ray comes from the neural points around it, and from images if there is an image branch.
 
-How much each frame of a capture counts, for how sharp it is.
+Source: Point-NeRF (CVPR 2022), section 3; Hybrid Neural Rendering (CVPR 2023), section 3.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -23,116 +23,58 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
-from sharpfield.fields.points.networks import ColourHead, PointSizes
+from sharpfield.fields.points.networks import ColourHead
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
 from sharpfield.formation.shutter import Pinhole
-from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.losses.regularizers import indecision
-from sharpfield.recipes.points.growth import GrowthOptions, grown, missing_points
+from sharpfield.recipes.points.growth import grown, missing_points
 from sharpfield.recipes.points.images import ImageBranch, Prepared
-from sharpfield.recipes.points.scene import MarchOptions, PointScene
+from sharpfield.recipes.points.scene import PointScene
 from sharpfield.rendering.points import Asked, Met
 from sharpfield.sampling.patches import PatchShape, draw_patches
 from sharpfield.sampling.pixels_and_pairs import pixel_table
+
+if TYPE_CHECKING:  # which imports this module
+    from sharpfield.recipes.point_nerf import PointNeRF
 
 Terms = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
-class DrawOptions:
-    """What a step looks at. Defaults: single pixels, as published for H."""
+class PatchSamplingOptions:
+    """Patches of a batch. Defaults: single pixels, as published for H."""
 
     patches: int = 3136
-    """Drawn per step."""
-    side: int = 1
-    """Pixels along the edge of each; 1 for single pixels."""
-    apart: tuple[int, int] = (1, 8)
-    """Fewest and most pixels from one pixel of a patch to the next."""
+    """Patches per step."""
+    patch_size: int = 1
+    """Side of a patch in pixels; 1 for single pixels."""
+    spacing: tuple[int, int] = (1, 8)
+    """Smallest and largest distance of neighbouring pixels of a patch, in pixels of the image."""
     frames: int = 1
-    """From which the patches of a step come."""
+    """Number of frames that the patches of a step come from."""
     border: int = 10
-    """Pixels at the edge of frames that are not learned from."""
-
-
-@runtime_checkable
-class PointNumbers(Protocol):
-    """The numbers of a recipe on points."""
-
-    @property
-    def steps(self) -> int:
-        """Length of the schedule."""
-        ...
-
-    @property
-    def rate(self) -> float:
-        """First learning rate of networks."""
-        ...
-
-    @property
-    def points_rate(self) -> float:
-        """First learning rate of points."""
-        ...
-
-    @property
-    def decay(self) -> float:
-        """What is left of the rates at the end."""
-        ...
-
-    @property
-    def decisive(self) -> float:
-        """Weight of the term that makes confidences 0 or 1."""
-        ...
-
-    @property
-    def start_colours(self) -> bool:
-        """Whether the network adds to known colours."""
-        ...
-
-    @property
-    def drawn(self) -> DrawOptions:
-        """What a step looks at."""
-        ...
-
-    @property
-    def cloud(self) -> CloudOptions:
-        """Where points come from."""
-        ...
-
-    @property
-    def sizes(self) -> PointSizes:
-        """Of the networks."""
-        ...
-
-    @property
-    def march(self) -> MarchOptions:
-        """How rays run."""
-        ...
-
-    @property
-    def growth(self) -> GrowthOptions:
-        """How points become more, and fewer."""
-        ...
+    """Width in pixels of the border of frames that is not sampled."""
 
 
 class PointModel(nn.Module):
     """Neural points and the frames they explain.
 
     Args:
-        recipe: With its numbers.
+        recipe: Options of the recipe.
         capture: As read; the model stays in its world.
-        seed: Of the run.
+        seed: Random seed of the run.
         scene: The points and their networks.
-        images: What training frames add, if anything.
-        blur: From rendered patches to recorded ones; None if frames are taken as they are.
-        light: Whether blur adds up light, or what frames store.
-        weight: How much each frame counts; one on average.
+        images: The image branch, if the recipe has one.
+        blur: Blur of rendered patches; None takes frames as sharp.
+        light: Whether blur averages linear light, or stored values.
+        weight: Weight of the loss of each frame; one on average.
     """
 
     heaviest_step = 0
 
     def __init__(
         self,
-        recipe: PointNumbers,
+        recipe: "PointNeRF",
         capture: Capture,
         seed: int,
         scene: PointScene,
@@ -156,22 +98,26 @@ class PointModel(nn.Module):
     weight: Tensor
 
     def draw(self, step: int) -> Batch:
-        """Patches of training frames, apart from those that must do without images."""
-        drawn = self.recipe.drawn
-        shape = PatchShape(drawn.side, drawn.apart if drawn.side > 1 else (1, 1), drawn.border)
+        """Patches of training frames; those rendered without images apart."""
+        sampling = self.recipe.sampling
+        shape = PatchShape(
+            sampling.patch_size,
+            sampling.spacing if sampling.patch_size > 1 else (1, 1),
+            sampling.border,
+        )
         seen = draw_patches(
-            self.table, drawn.patches, shape, frames=drawn.frames, seed=self.seed, step=step
+            self.table, sampling.patches, shape, frames=sampling.frames, seed=self.seed, step=step
         ).to(self.scene.device)
         if self.images is None:
             return {"frames": seen}
         made = generator(self.seed, step, "alone")
         mixed = torch.randperm(len(seen), generator=made).to(seen.device)
-        alone = int(len(seen) * self.images.options.drop)
+        alone = int(len(seen) * self.images.options.dropout)
         batch: Batch = {"frames": seen[mixed[alone:]]}
         return batch | {"alone": seen[mixed[:alone]]} if alone else batch
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Error of the pixels whose rays met a point, and indecision of the points."""
+        """Squared error of the pixels whose rays hit a point, and the confidence regulariser."""
         parts = [part for part in batch.values() if isinstance(part, Pixels)]
         seen = Pixels.cat(parts)
         flat = seen.reshape(-1)
@@ -192,9 +138,9 @@ class PointModel(nn.Module):
         return terms | self._decided(met)
 
     def colour(self, asked: Asked, ready: Prepared | None) -> Float[Tensor, "n c"]:
-        """Of places on rays, as frames store it."""
+        """Colour of samples on rays, as frames store it."""
         field, start = self.scene.field, None
-        if self.recipe.start_colours:
+        if self.recipe.residual_colours:
             start = field.mean_colour(asked.rows, asked.way)
         feature = field.feature(asked.hidden, asked.direction)
         if self.images is not None and ready is not None:
@@ -215,11 +161,11 @@ class PointModel(nn.Module):
         return Radiance(light, met.depth, met.opacity, flat.weight).reshape(*rays.shape)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As the frames store it."""
+        """Linear light as stored values."""
         return self.tone.encode(light).clamp(0, 1)
 
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
-        """Points where rays that find something opaque border on rays that miss."""
+        """Grow points beside rays that miss, and prune those of low confidence."""
         options, steps = self.recipe.growth, self.recipe.steps
         if not options.due(step, steps):
             return []
@@ -229,11 +175,11 @@ class PointModel(nn.Module):
         return [] if growth is None else [(points, growth)]
 
     def groups(self) -> list[Group]:
-        """Networks and points."""
+        """Parameters of networks and points with their learning rates."""
         recipe = self.recipe
         until = max(recipe.steps, 1)
-        networks = exponential(recipe.rate, recipe.decay * recipe.rate, until=until)
-        points = exponential(recipe.points_rate, recipe.decay * recipe.points_rate, until=until)
+        networks = exponential(recipe.lr, recipe.lr_final * recipe.lr, until=until)
+        points = exponential(recipe.points_lr, recipe.lr_final * recipe.points_lr, until=until)
         groups = self.scene.groups(networks, points)
         for name in ("head", "images", "blur"):
             part = getattr(self, name)
@@ -242,7 +188,7 @@ class PointModel(nn.Module):
         return groups
 
     def _blurred(self, colour: Float[Tensor, "b c"], seen: Pixels, met: Met) -> Tensor:
-        """Rendered patches as the frames may have recorded them."""
+        """Rendered patches, blurred as the recorded ones."""
         assert self.blur is not None
         patches = colour.view(*seen.value.shape)
         known = met.hit.view(seen.value.shape[:-1]).to(colour.dtype)
@@ -253,9 +199,9 @@ class PointModel(nn.Module):
         return self.tone.encode(blurred.clamp_min(0)).view(colour.shape)
 
     def _decided(self, met: Met) -> Terms:
-        """The term on the confidences of the points that rays met."""
-        if self.recipe.decisive == 0:
+        """The confidence regulariser of the points that rays hit (Point-NeRF, section 4.3)."""
+        if self.recipe.confidence_weight == 0:
             return {}
         taken = met.rows[met.rows >= 0].unique()
         sure = self.scene.field.points.take(taken).confidence[:, 0]
-        return {"decisive": self.recipe.decisive * indecision(sure)}
+        return {"confidence_weight": self.recipe.confidence_weight * indecision(sure)}

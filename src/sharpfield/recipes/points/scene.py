@@ -31,30 +31,31 @@ BEYOND = 1.25
 
 @dataclass(frozen=True)
 class MarchOptions:
-    """How rays run through points. Defaults: Hybrid Neural Rendering's for ScanNet."""
+    """Samples on rays through points. Defaults: Hybrid Neural Rendering's for ScanNet."""
 
     voxel: float = 0.008
-    """In world units; 0 for 0.8 times the distance between points. Neighbours are up to 4 away."""
+    """Edge of a voxel in world units; 0 takes 0.8 times the distance between points. Neighbours are
+    up to 4 voxels away."""
     steps: int = 400
-    """Between near and far; 0 for steps of 2.5 voxels."""
-    asked: int = 24
-    """Most places of a ray near which points are looked for."""
+    """Steps between near and far; 0 takes steps of 2.5 voxels."""
+    max_samples: int = 24
+    """Maximum number of samples on a ray whose neighbours are looked up."""
     thickness: float = 0.0
-    """Of what stops light at each place; 0 for that of a voxel."""
+    """Length in world units over which the density of a sample absorbs light; 0 takes a voxel."""
     background: float = 1.0
-    """Behind everything, as frames store it: 0 black to 1 white."""
+    """Stored value of the background: 0 black to 1 white."""
 
 
 class PointScene(nn.Module):
     """Neural points that explain a capture, in the capture's own world.
 
     Args:
-        cloud: Where points start.
-        sizes: Of the networks; a `unit` of 0 becomes the radius.
-        march: How rays run.
-        capture: What is to be explained.
-        seed: Of the run.
-        weight: How much each frame counts for first colours.
+        cloud: The first points.
+        sizes: Sizes of the networks; a `unit` of 0 becomes the radius of neighbours.
+        march: Samples on rays.
+        capture: As read.
+        seed: Random seed of the run.
+        weight: Weight of each frame in the first colours.
     """
 
     poses: Tensor
@@ -93,7 +94,7 @@ class PointScene(nn.Module):
             near=capture.near,
             far=far,
             steps=march.steps or max(round((far - capture.near) / (STEP * voxel)), 1),
-            asked=march.asked,
+            asked=march.max_samples,
             thickness=march.thickness or voxel,
             background=march.background,
         )
@@ -103,7 +104,7 @@ class PointScene(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return self.poses.device
 
     def meet(
@@ -114,13 +115,13 @@ class PointScene(nn.Module):
         frame: Int64[Tensor, "b"] | None = None,
         step: int | None = None,
     ) -> Met:
-        """What rays meet.
+        """Render rays.
 
         Args:
             rays: On one leading axis.
-            colour: Of the places that send light.
-            frame: To which each ray belongs; by default the one nearest in time.
-            step: Of training, whose steps along rays are uneven; None for evaluation.
+            colour: Colour of the samples that send light.
+            frame: Frame of each ray; by default the frame nearest in time.
+            step: Training step, whose samples are jittered; None for evaluation.
         """
         turn = None
         if self.field.sizes.axes == "camera":
