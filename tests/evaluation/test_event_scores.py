@@ -7,7 +7,7 @@ import torch
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.rays import Radiance, Rays
-from sharpfield.evaluation.event_scores import event_scores
+from sharpfield.evaluation.event_scores import score_events
 from sharpfield.simulation.scenes.moving import moving_scene
 from tests.evaluation.fake import Sky
 from tests.recipes.moving import tiny_moving
@@ -34,7 +34,7 @@ class Scene(Sky):
 
 def scores(contrast: float, **change) -> dict[str, float]:
     capture = replace(tiny_moving(), **change)
-    found = event_scores(Scene(capture, contrast), capture, windows=2, lengths=(1 / 4,))
+    found = score_events(Scene(capture, contrast), capture, windows=2, lengths=(1 / 4,))
     assert found is not None
     return found["lengths"]["0.25"]
 
@@ -57,4 +57,4 @@ def test_the_true_scene_is_far_above_the_floor():
 
 def test_without_held_out_events_there_are_no_scores():
     capture = replace(tiny_moving(), test_events=None)
-    assert event_scores(Scene(capture, 1.0), capture) is None
+    assert score_events(Scene(capture, 1.0), capture) is None

@@ -6,7 +6,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sharpfield.evaluation.event_videos import GAP_PX, WINDOWS, event_videos, events_section
+from sharpfield.evaluation.event_videos import GAP_PX, WINDOWS, events_section, write_event_videos
 from sharpfield.evaluation.measure import evaluate
 from sharpfield.evaluation.report import RunDescription, write_report
 from tests.evaluation.test_event_scores import Scene
@@ -21,7 +21,7 @@ def frames_of(path: Path) -> np.ndarray:
 
 def test_a_video_shows_what_was_recorded_beside_what_is_predicted(tmp_path: Path):
     moving = tiny_moving()
-    (told,) = event_videos(Scene(moving, 1.0), moving, tmp_path)
+    (told,) = write_event_videos(Scene(moving, 1.0), moving, tmp_path)
     video = frames_of(tmp_path / told["video"])
     assert video.shape == (WINDOWS, 240, 2 * 240 + GAP_PX, 3)
     recorded, predicted = (part.astype(int) for part in (video[:, :, :240], video[:, :, -240:]))
@@ -39,7 +39,7 @@ def brighter(part: np.ndarray) -> np.ndarray:
 
 def frames_of_nothing(folder: Path) -> np.ndarray:
     moving = tiny_moving()
-    (told,) = event_videos(Scene(moving, 0.0), moving, folder / "nothing")
+    (told,) = write_event_videos(Scene(moving, 0.0), moving, folder / "nothing")
     return frames_of(folder / "nothing" / told["video"])[:, :, -240:].astype(int)
 
 
@@ -55,6 +55,6 @@ def test_the_report_plays_it(tmp_path: Path):
 
 def test_without_held_out_events_there_is_no_video(tmp_path: Path):
     still = replace(tiny_moving(), test_events=None)
-    assert event_videos(Scene(still, 1.0), still, tmp_path) == []
+    assert write_event_videos(Scene(still, 1.0), still, tmp_path) == []
     assert events_section(tmp_path, {"mean": {}}) is None
     assert not list(tmp_path.iterdir())

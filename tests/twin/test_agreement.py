@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.twin.agreement import compare_events, side_by_side
+from sharpfield.twin.agreement import busiest_window, compare_events
 from tests.evaluation.fake import random_events
 
 EDGES = [0, 400_000, 700_000, 1_000_001]
@@ -64,7 +64,7 @@ def test_rectified_positions_count_at_the_nearest_pixel():
 
 def test_the_busiest_window_is_shown_recorded_first():
     events = random_events(3000)
-    image = side_by_side(events[:0], events, EDGES)
+    image = busiest_window(events[:0], events, EDGES)
     assert image.shape == (32, 40 + 4 + 40, 3)
     assert (image[:, 40:] == 255).all() and (image[:, :40] < 255).any()
 

@@ -10,7 +10,7 @@ Source: EvDNeRF (WACV 2024) and its released evaluation for PSNR, SSIM and MAE o
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -93,69 +93,50 @@ def _count_mae(frame: EventFrame, where: Tensor) -> float:
     return float(error[where].mean()) if where.any() else 0.0
 
 
+def _metric(
+    name: str, title: str, definition: str, better: Literal["higher", "lower"] = "higher"
+) -> Metric:
+    return Metric(name, title, definition, better, "{:.4g}")
+
+
 EVENT_METRICS: dict[Metric, Callable[[EventFrame], float]] = {
-    Metric(
+    _metric(
         "event_psnr",
         "event PSNR (dB)",
         "dB; peak is twice the largest recorded change of all windows (as published)",
-        "higher",
-        "{:.4g}",
     ): lambda frame: _event_psnr(frame, frame.change),
-    Metric(
-        "event_mae",
-        "event MAE",
-        "mean absolute difference, natural log",
-        "lower",
-        "{:.4g}",
+    _metric(
+        "event_mae", "event MAE", "mean absolute difference, natural log", "lower"
     ): lambda frame: float((frame.change - frame.recorded).abs().mean()),
-    Metric(
+    _metric(
         "event_ssim",
         "event SSIM",
         "on event frames mapped from -M...M to 0...1, M the largest recorded change",
-        "higher",
-        "{:.4g}",
     ): lambda frame: float(ssim(frame.image(frame.change), frame.image(frame.recorded))),
-    Metric(
+    _metric(
         "count_psnr",
         "PSNR of counts (dB)",
         f"dB, in events, peak {2 * MOST_COUNT:g}, both clipped to +-{MOST_COUNT:g}",
-        "higher",
-        "{:.4g}",
     ): lambda frame: _count_psnr(frame, frame.predicted_count),
-    Metric(
+    _metric(
         "count_mae_busy",
         "MAE of counts, active pixels",
         "mean absolute difference in events, where any were recorded",
         "lower",
-        "{:.4g}",
     ): lambda frame: _count_mae(frame, frame.active),
-    Metric(
-        "count_mae_silent",
-        "MAE of counts, silent pixels",
-        "the same where none were",
-        "lower",
-        "{:.4g}",
+    _metric(
+        "count_mae_silent", "MAE of counts, silent pixels", "the same where none were", "lower"
     ): lambda frame: _count_mae(frame, ~frame.active),
-    Metric(
+    _metric(
         "event_f1",
         "F1 of active pixels",
         "of pixels with at least one event; predictions are rounded towards zero",
-        "higher",
-        "{:.4g}",
     ): lambda frame: _f1(frame.predicted_count.trunc() != 0, frame.net_count != 0),
-    Metric(
-        "none_psnr",
-        "event PSNR of no events",
-        "event_psnr of predicting nothing",
-        "higher",
-        "{:.4g}",
+    _metric(
+        "none_psnr", "event PSNR of no events", "event_psnr of predicting nothing"
     ): lambda frame: _event_psnr(frame, 0 * frame.change),
-    Metric(
-        "none_count_psnr",
-        "PSNR of counts of no events",
-        "count_psnr of predicting nothing",
-        "higher",
-        "{:.4g}",
+    _metric(
+        "none_count_psnr", "PSNR of counts of no events", "count_psnr of predicting nothing"
     ): lambda frame: _count_psnr(frame, 0 * frame.net_count),
 }
 """Metrics of one event frame."""
@@ -170,7 +151,7 @@ class HasLogLight(Protocol):
         ...
 
 
-def event_scores(
+def score_events(
     model: Model,
     capture: Capture,
     *,

@@ -22,7 +22,7 @@ from sharpfield.evaluation.event_scores import (
     log_intensity,
     mean_threshold,
 )
-from sharpfield.report.colormaps import colour_signs
+from sharpfield.report.colormaps import colour_signs, side_by_side
 from sharpfield.report.event_frames import full_count
 from sharpfield.report.tables import TextTable
 from sharpfield.report.video import write_video
@@ -42,7 +42,7 @@ GAP_PX = 4
 Rgb = UInt8[np.ndarray, "height width 3"]
 
 
-def event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
+def write_event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
     """Write a video for some held-out event cameras.
 
     Args:
@@ -117,5 +117,4 @@ def _beside(left: Rgb, right: Rgb) -> UInt8[np.ndarray, "high wide 3"]:
     """Two images side by side, enlarged."""
     factor = max(HEIGHT_PX // left.shape[0], 1)
     left, right = (np.kron(one, np.ones((factor, factor, 1), np.uint8)) for one in (left, right))
-    gap = np.full((left.shape[0], GAP_PX, 3), 128, np.uint8)
-    return np.concatenate([left, gap, right], 1)
+    return side_by_side(left, right, gap_px=GAP_PX, grey=128)

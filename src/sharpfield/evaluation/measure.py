@@ -30,8 +30,8 @@ from sharpfield.evaluation.alignment_and_depth import (
     scaled_depth_error,
 )
 from sharpfield.evaluation.brightness import Brightness
-from sharpfield.evaluation.event_scores import event_scores
-from sharpfield.evaluation.event_videos import event_videos
+from sharpfield.evaluation.event_scores import score_events
+from sharpfield.evaluation.event_videos import write_event_videos
 from sharpfield.evaluation.protocol import describe
 from sharpfield.evaluation.refine import training_pose_errors
 from sharpfield.evaluation.scores import mean, score, view_metrics
@@ -124,7 +124,7 @@ def evaluate(
     known, renders = view_metrics(lpips), run / "renders"
     tested = [_row(view, brightness, known, renders / "test") for view in test_views]
     learned = [_row(view, brightness, known, renders / "train") for view in train_views]
-    events = event_scores(model, capture)
+    events = score_events(model, capture)
     metrics: dict[str, Any] = {
         "protocol": {
             **describe(capture, test, lpips, too_small=too_small),
@@ -139,7 +139,7 @@ def evaluate(
         "train": _training(run),
     }
     if events is not None:
-        metrics["events"] = {**events, "videos": event_videos(model, capture, run)}
+        metrics["events"] = {**events, "videos": write_event_videos(model, capture, run)}
     if (errors := training_pose_errors(model, capture)) is not None:
         metrics["poses"] = errors
     if baselines:

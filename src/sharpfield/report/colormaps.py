@@ -78,3 +78,11 @@ def stored_as_bytes(images: Shaped[np.ndarray, "*n h w c"]) -> UInt8[np.ndarray,
     if images.dtype == np.uint8:
         return np.asarray(images)
     return np.rint(images * (255.0 / np.iinfo(images.dtype).max)).astype(np.uint8)
+
+
+def side_by_side(
+    left: Rgb, right: Rgb, *, gap_px: int = 4, grey: int = 255
+) -> UInt8[np.ndarray, "h total 3"]:
+    """Two images of equal height with a gap between them."""
+    gap = np.full((left.shape[0], gap_px, 3), grey, np.uint8)
+    return np.concatenate([left, gap, right], 1)  # [h, w + gap + w, 3]

@@ -20,14 +20,11 @@ from jaxtyping import Float, Int32, Int64, UInt8
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.metrics.image import relative_count_error
-from sharpfield.report.colormaps import colour_signs
+from sharpfield.report.colormaps import colour_signs, side_by_side
 from sharpfield.report.event_frames import count_events, full_count, signed
 
 MOST_COUNT = 20
 """Counts of a pixel and window are clipped to this before they are compared as images."""
-
-GAP_PX = 4
-"""Gap between images side by side."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +97,7 @@ def compare_events(
     )
 
 
-def side_by_side(
+def busiest_window(
     predicted: EventStream, recorded: EventStream, edges_us: Sequence[int]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Event frames of the window with the most events: recorded left, predicted right."""
@@ -109,9 +106,7 @@ def side_by_side(
     window = edges_us[chosen], edges_us[chosen + 1]
     frames = [signed(count_events(part.window(*window))) for part in (recorded, predicted)]
     full = full_count(frames[0])
-    left, right = (colour_signs(frame, full) for frame in frames)
-    gap = np.full((left.shape[0], GAP_PX, 3), 255, np.uint8)
-    return np.concatenate([left, gap, right], 1)
+    return side_by_side(*(colour_signs(frame, full) for frame in frames))
 
 
 def _counts(events: EventStream, edges_us: Sequence[int]) -> Int32[np.ndarray, "n h w 2"]:

@@ -20,7 +20,7 @@ from sharpfield.recordings.open import open_events
 from sharpfield.report.event_frames import count_events, writing_frames
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
-from sharpfield.twin.agreement import compare_events, side_by_side
+from sharpfield.twin.agreement import busiest_window, compare_events
 from sharpfield.twin.event_twin import Viewpoint
 
 ImageProgress = Callable[[int, int], None]
@@ -158,7 +158,7 @@ def write_comparison(
     table, image = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
     with replacing(table) as temporary:
         temporary.write_text(json.dumps(found | about, indent=2, allow_nan=False) + "\n")
-    write_image(image, side_by_side(*streams, edges_us))
+    write_image(image, busiest_window(*streams, edges_us))
     for name, value in found.items():
         shown = "-" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
         console.print(f"  {name:<18} {shown}")

@@ -71,7 +71,7 @@ class EventChange:
     """Mean polarity of the next event, second exposure minus first."""
 
 
-def exposure_pairs(
+def find_exposure_pairs(
     capture: Capture, *, most: int, encoding: str | None = None
 ) -> list[ExposurePair]:
     """Pairs of consecutive exposures that are covered by events, spread over the capture.

@@ -13,7 +13,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import numpy_generator
 from sharpfield.events.index import build_index
-from sharpfield.preparation.calibrate.exposure_pairs import exposure_pairs
+from sharpfield.preparation.calibrate.exposure_pairs import find_exposure_pairs
 from sharpfield.preparation.calibrate.threshold_fit import (
     DEAD_US,
     DRIFT,
@@ -94,7 +94,7 @@ def calibrate(capture: Capture, options: CalibrateOptions) -> ThresholdCalibrati
         CaptureError: Frames or events are missing, or too little changed.
     """
     index = build_index(capture.needed_events)
-    pairs = exposure_pairs(capture, most=options.pairs)
+    pairs = find_exposure_pairs(capture, most=options.pairs)
     _, hot = odd_pixels(counts(capture.needed_events))
     every = Equations.of(capture, index, pairs, without=hot)
     some = Equations.of(capture, index, pairs, without=hot, most=MAX_EQUATIONS)

@@ -17,7 +17,7 @@ from sharpfield.events.index import EventIndex, build_index
 from sharpfield.preparation.calibrate.exposure_pairs import (
     ExposurePair,
     change_by_events,
-    exposure_pairs,
+    find_exposure_pairs,
 )
 from sharpfield.preparation.doctor.findings import Checkup, Curve
 from sharpfield.report.colormaps import colour_signs
@@ -122,7 +122,7 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
         checkup.add("note", "agreement", "a single frame cannot be compared with events")
         return None
     index = build_index(capture.needed_events)
-    pairs = exposure_pairs(capture, most=PAIRS)
+    pairs = find_exposure_pairs(capture, most=PAIRS)
     from_frames = np.stack([_luma_change(pair) for pair in pairs])
     usable = np.stack([pair.usable.all(-1) for pair in pairs])
     shifts = np.arange(-MAX_SHIFT_US, MAX_SHIFT_US + 1, COARSE_US)
