@@ -67,7 +67,7 @@ def single(part: Any, name: str) -> Iterator[str]:
 def function(part: Any, name: str, *, level: int = 3) -> Iterator[str]:
     """Signature and docstring."""
     yield f"{'#' * level} `{name}`"
-    yield f"```python\n{signature(part, name)}\n```"
+    yield f"```py\n{signature(part, name)}\n```"
     yield from docstring(part)
 
 
