@@ -17,7 +17,7 @@ from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
 from sharpfield.preparation.ingest.pipeline import IngestSummary, ingest
-from sharpfield.preparation.ingest.stage import Stage
+from sharpfield.preparation.ingest.stage import StagingFolder
 from sharpfield.recordings.open import open_recording
 from sharpfield.recordings.recording import Frame, ReaderOptions, Recording, Triggers
 from sharpfield.simulation.sensors.event_pixels import EventSensor
@@ -217,12 +217,11 @@ class Unplugged(Exception):
 
 
 @pytest.mark.parametrize("after", ["counting events", "writing frames", "writing events"])
-def test_what_was_interrupted_goes_on(truth, tmp_path, monkeypatch, after):
+def test_what_was_interrupted_goes_on(truth, tmp_path, after):
     def unplug(doing: str, done: int, total: int | None) -> None:
         if doing == after and done > 5:
             raise Unplugged
 
-    monkeypatch.setattr("sharpfield.preparation.ingest.stage.PART", 65_536)
     events, frames = of_arrays(truth.needed_events, in_memory(truth))
     out = tmp_path / "capture"
     with pytest.raises(Unplugged):
@@ -249,7 +248,7 @@ def test_parts_that_are_written_are_not_written_again(truth, tmp_path):
         t_us=np.sort(events.t_us[whole]),
         p=events.p[whole],
     )
-    stage = Stage(tmp_path / "capture", {"plan": 1}, part=65_536)
+    stage = StagingFolder(tmp_path / "capture", {"plan": 1}, part=65_536)
 
     def truncated():
         yield many[:100_000]
@@ -259,7 +258,7 @@ def test_parts_that_are_written_are_not_written_again(truth, tmp_path):
         stage.write(truncated(), many[:0], span)
     written = {path.name: path.stat().st_mtime_ns for path in stage.folder.glob("part-*")}
     assert list(written) == ["part-000.h5"]
-    stage = Stage(tmp_path / "capture", {"plan": 1}, part=65_536)
+    stage = StagingFolder(tmp_path / "capture", {"plan": 1}, part=65_536)
     assert stage.resumed
     stage.write(iter([many[:30], many[30:]]), many[:0], span)
     assert written["part-000.h5"] == (stage.folder / "part-000.h5").stat().st_mtime_ns
@@ -271,9 +270,9 @@ def test_parts_that_are_written_are_not_written_again(truth, tmp_path):
 
 
 def test_another_plan_starts_anew(tmp_path):
-    first = Stage(tmp_path / "capture", {"files": 1})
+    first = StagingFolder(tmp_path / "capture", {"files": 1})
     (first.folder / "frames.json").write_text("{}")
-    again = Stage(tmp_path / "capture", {"files": 2})
+    again = StagingFolder(tmp_path / "capture", {"files": 2})
     assert not again.resumed
     assert not again.frames_record.exists()
 

@@ -28,12 +28,6 @@ from sharpfield.preparation.ingest.clock import (
     shifted,
     with_exposure,
 )
-from sharpfield.preparation.ingest.frames import (
-    WrittenFrames,
-    load_frames,
-    save_frames,
-    write_frames,
-)
 from sharpfield.preparation.ingest.lens import (
     DEMOSAIC,
     CaptureGeometry,
@@ -41,7 +35,15 @@ from sharpfield.preparation.ingest.lens import (
     empty_stream,
 )
 from sharpfield.preparation.ingest.options import IngestOptions, assign_roles
-from sharpfield.preparation.ingest.stage import Stage, as_json, fingerprint
+from sharpfield.preparation.ingest.stage import (
+    StagingFolder,
+    WrittenFrames,
+    as_json,
+    fingerprint,
+    load_frames,
+    save_frames,
+    write_frames,
+)
 from sharpfield.preparation.ingest.survey import EventFilter, Survey, hot_pixels, survey_events
 from sharpfield.recordings.chunks import resolve_size
 from sharpfield.recordings.recording import Recording
@@ -92,7 +94,7 @@ def ingest(
         "layouts": [recording.layout for recording in recordings],
         "options": as_json(options),
     }
-    stage = Stage(out, plan)
+    stage = StagingFolder(out, plan)
     return _Ingest(events, frames, options, stage, progress).run(out.name)
 
 
@@ -104,7 +106,7 @@ class _Ingest:
         events: Recording | None,
         frames: Recording | None,
         options: IngestOptions,
-        stage: Stage,
+        stage: StagingFolder,
         progress: StepProgress,
     ) -> None:
         self._events, self._frames = events, frames
