@@ -10,6 +10,7 @@ from types import FrameType
 import pytest
 
 import sharpfield as sf
+from sharpfield.core.protocols import Model
 from sharpfield.recipes.settings.presets import prepared
 
 PACKAGE = Path(sf.__file__).parent
@@ -47,13 +48,19 @@ def entered() -> Iterator[set[str]]:
 
 
 def functions_of_a_step(recipe: str, folder: Path) -> set[str]:
+    capture = sf.read(folder)
+    made = prepared(recipe, "draft", capture=capture, device="cpu").lasting(STEPS)
+    model = made.build(capture, 0)
+    take_step(model)  # kernels are compiled unwatched, which is faster
     with entered() as names:
-        capture = sf.read(folder)
-        made = prepared(recipe, "draft", capture=capture, device="cpu").lasting(STEPS)
-        model = made.build(capture, 0)
-        terms = model.losses(model.draw(LATE), LATE)
-        sum(terms.values()).backward()
+        sf.read(folder)
+        take_step(model)
     return names
+
+
+def take_step(model: Model) -> None:
+    terms = model.losses(model.draw(LATE), LATE)
+    sum(terms.values()).backward()
 
 
 @pytest.fixture(scope="module")
