@@ -67,11 +67,11 @@ def test_dsec_counts_from_its_offset_in_us(tmp_path):
 def test_neither_unit_nor_size_is_guessed(tmp_path):
     path = write_flat(tmp_path / "events.h5")
     with open_events(path, size=SIZE) as file:
-        with pytest.raises(CaptureError, match="does not say the unit") as caught:
+        with pytest.raises(CaptureError, match="does not state the unit") as caught:
             file.part(0, 1)
     assert "ns, us, ms or s" in str(caught.value)
     with open_events(path, unit="us") as file:
-        with pytest.raises(CaptureError, match="does not say the size"):
+        with pytest.raises(CaptureError, match="does not state its sensor resolution"):
             file.part(0, 1)
 
 

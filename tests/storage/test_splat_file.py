@@ -93,7 +93,7 @@ def test_files_of_others_are_refused(tmp_path):
         fewer[name] = rows[name]
     write_ply(path, Ply(fewer))
     with pytest.raises(
-        CaptureError, match=r"got    8 properties f_rest_\*\n  do     there are 0, 9"
+        CaptureError, match=r"got    8 properties f_rest_\*\n  do     there must be 0, 9"
     ):
         read_splats(path)
 

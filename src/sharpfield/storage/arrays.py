@@ -1,12 +1,8 @@
-"""npy and npz files, loaded with a clear message when they are missing, cut off or pickled.
+"""npy and npz files with clear errors, arrays of pickled files, and a check before replacing.
 
-Arrays in pickled files, without running what such a file may hold.
-
-A pickle is a program for building objects, and may name any function to call. Here it may name
-only what arrays of numbers are built from; everything else is refused before it is called. Even so
-such a file is opened only when the user says so.
-
-Writing a capture must never destroy something that is not one.
+A pickle is a program that builds objects, and may name any function to call. Here it may only name
+what builds arrays of numbers; everything else is refused before it is called. Even so such a file
+is opened only when the user asks for it.
 """
 
 import pickle
@@ -24,33 +20,37 @@ from sharpfield.core.errors import CaptureError
 Array = Shaped[np.ndarray, "..."]
 
 BLOCK = 1 << 20
-"""Bytes read at once."""
+"""Bytes that are read at once."""
 
 PICKLED = "allow_pickle"
-"""What numpy's message mentions when a file holds pickled objects."""
+"""Part of numpy's error message for files of pickled objects."""
 
 
 def load_array(path: Path) -> Array:
-    """The array of an npy file.
+    """Read the array of an npy file.
 
     Raises:
         CaptureError: The file is missing, malformed, or holds pickled Python objects.
     """
     loaded = _load(path)
     if not isinstance(loaded, np.ndarray):
-        raise CaptureError("expected a single array", where=path, got="an npz archive")
+        raise CaptureError(
+            "expected a single array", where=path, got="an npz archive", do="save it with np.save"
+        )
     return loaded
 
 
 def load_arrays(path: Path) -> dict[str, Array]:
-    """All arrays of an npz file, by name.
+    """Read all arrays of an npz file, by name.
 
     Raises:
         CaptureError: The file is missing, malformed, or holds pickled Python objects.
     """
     loaded = _load(path)
     if isinstance(loaded, np.ndarray):
-        raise CaptureError("expected an npz archive of arrays", where=path, got="a single array")
+        raise CaptureError(
+            "expected an npz archive", where=path, got="a single array", do="save it with np.savez"
+        )
     with loaded:
         try:
             return {name: loaded[name] for name in loaded.files}
@@ -59,7 +59,7 @@ def load_arrays(path: Path) -> dict[str, Array]:
 
 
 class Column:
-    """A column of numbers that grows in a file of its own, which goes into an npz file later."""
+    """A column of numbers that is appended to in a temporary file, for an npz file later."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -67,7 +67,7 @@ class Column:
         self._count = 0
 
     def append(self, values: Shaped[np.ndarray, "n"]) -> None:
-        """Add numbers; what comes first decides the type."""
+        """Append numbers; the first ones decide the type."""
         if not self._count:
             self._kind = values.dtype
         with self._path.open("ab") as file:
@@ -75,7 +75,7 @@ class Column:
         self._count += len(values)
 
     def blocks(self) -> Iterator[bytes]:
-        """The whole column as an npy file, piece by piece."""
+        """The bytes of the column as an npy file, block by block."""
         header = BytesIO()
         about = {
             "descr": np.lib.format.dtype_to_descr(self._kind),
@@ -89,7 +89,7 @@ class Column:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array | Column]) -> None:
-    """Write an npz file; unlike `np.savez` it takes any name, also `file`."""
+    """Write an npz file; unlike `np.savez`, any name is allowed, also `file`."""
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -127,11 +127,11 @@ BUILDERS = {
         ("numeric", "_frombuffer"),
     )
 } | {("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode")}
-"""What numpy's own pickles of arrays call; the last turns text into bytes."""
+"""What numpy's own pickles of arrays call; the last converts text to bytes."""
 
 
 def load_pickled(path: Path) -> list[Shaped[np.ndarray, "..."]]:
-    """The arrays of a `.pkl` file, or of an `.npy` file of objects.
+    """Read the arrays of a `.pkl` file, or of an `.npy` file of objects.
 
     Raises:
         CaptureError: The file is missing or malformed, or holds anything but arrays of numbers.
@@ -150,7 +150,11 @@ def load_pickled(path: Path) -> list[Shaped[np.ndarray, "..."]]:
         ) from None
     arrays: list[Any] = list(found) if isinstance(found, list | tuple | np.ndarray) else [found]
     if not all(isinstance(array, np.ndarray) and array.dtype.kind in "iufb" for array in arrays):
-        raise CaptureError("a pickled file holds more than arrays of numbers", where=path)
+        raise CaptureError(
+            "a pickled file holds more than arrays of numbers",
+            where=path,
+            do="save the arrays alone, with np.savez",
+        )
     return arrays
 
 
@@ -168,19 +172,19 @@ def _objects(file: BinaryIO) -> Sequence[Any] | np.ndarray:
 
 
 class _Arrays(pickle.Unpickler):
-    """Refuses to name anything but what arrays are built from."""
+    """Refuses every name but those that build arrays."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in BUILDERS:
-            raise pickle.UnpicklingError(f"the file names {module}.{name}, which is no array")
+            raise pickle.UnpicklingError(f"the file calls {module}.{name}, which builds no array")
         return super().find_class(module, name)
 
 
 def expect_replaceable(folder: Path, recognise: Callable[[Path], bool]) -> None:
-    """Make sure that a folder may be written: it is new, empty, or holds an earlier capture.
+    """Check that a folder may be replaced: it is new, empty, or holds a capture.
 
     Args:
-        folder: What is about to be replaced.
+        folder: The folder that will be replaced.
         recognise: Whether a folder holds a capture of the layout to be written.
 
     Raises:
@@ -193,5 +197,5 @@ def expect_replaceable(folder: Path, recognise: Callable[[Path], bool]) -> None:
     raise CaptureError(
         "will not replace what is not a capture",
         where=folder,
-        do="choose another place, or empty it",
+        do="choose another folder, or empty this one",
     )

@@ -1,4 +1,4 @@
-"""What event files store, column by column, turned into what an `EventStream` holds.
+"""Conversion of the columns of event files to those of an `EventStream`.
 
 Files store times in ns, us, ms or s, as integers or floats; polarities as {0, 1}, {-1, +1} or
 booleans; coordinates as integers of any width or as floats, if rectified. Units are never guessed.
@@ -17,17 +17,17 @@ UNITS = {"ns": 1e-3, "us": 1.0, "ms": 1e3, "s": 1e6}
 """Units of time, in us."""
 
 LATEST_US = 2.0**62
-"""A time that no clock shows, in 146,000 years."""
+"""Upper limit of plausible times: 146,000 years."""
 
 Stored = Shaped[np.ndarray, "n"]
 """A column as the file has it: integers, floats or booleans."""
 
 
 def known_unit(unit: str) -> str:
-    """The unit itself.
+    """Return the unit itself.
 
     Raises:
-        OptionError: It is none of `UNITS`.
+        OptionError: It is not one of `UNITS`.
     """
     if unit not in UNITS:
         raise OptionError("unknown unit of time", got=unit, do=f"use one of {', '.join(UNITS)}")
@@ -35,7 +35,7 @@ def known_unit(unit: str) -> str:
 
 
 def whole_us(stored: Stored, unit: str, where: object) -> Int64[np.ndarray, "n"]:
-    """Times in whole us; finer ones are rounded, halves of a us upwards.
+    """Times in whole us; finer ones are rounded, halves upwards.
 
     Raises:
         CaptureError: A time is not finite.
@@ -45,7 +45,7 @@ def whole_us(stored: Stored, unit: str, where: object) -> Int64[np.ndarray, "n"]
         if len(wrong):
             finite = np.isfinite(stored[wrong[0]])
             raise CaptureError(
-                "a time is beyond all dates" if finite else "a time is not a finite number",
+                "a time is implausibly large" if finite else "a time is not a finite number",
                 where=f"{where}, entry {wrong[0]}",
                 got=stored[wrong[0]],
                 do="check the unit" if finite else "drop these entries when converting",
@@ -63,8 +63,8 @@ def polarity(stored: Stored, where: object) -> Int8[np.ndarray, "n"]:
     Raises:
         CaptureError: There is another value, or 0 and -1 both occur.
     """
-    bright, zero, dark = stored == 1, stored == 0, stored == -1
-    wrong = np.flatnonzero(~(bright | zero | dark))
+    positive, zero, negative = stored == 1, stored == 0, stored == -1
+    wrong = np.flatnonzero(~(positive | zero | negative))
     if len(wrong):
         raise CaptureError(
             "polarity must be 0 or 1, or -1 or +1",
@@ -72,21 +72,21 @@ def polarity(stored: Stored, where: object) -> Int8[np.ndarray, "n"]:
             got=stored[wrong[0]],
             do="check which column is which",
         )
-    if zero.any() and dark.any():
+    if zero.any() and negative.any():
         raise CaptureError(
             "polarity takes three values",
             where=where,
-            got=f"{dark.sum()} times -1, {zero.sum()} times 0, {bright.sum()} times 1",
-            do="map darker events to -1 or to 0, not to both",
+            got=f"{negative.sum()} times -1, {zero.sum()} times 0, {positive.sum()} times 1",
+            do="map negative events to -1 or to 0, not to both",
         )
-    return np.where(bright, 1, -1).astype(np.int8)
+    return np.where(positive, 1, -1).astype(np.int8)
 
 
 def coordinates(stored: Stored, name: str, where: object) -> Stored:
     """Pixel coordinates as 16-bit integers, or rectified ones as floats.
 
     Raises:
-        CaptureError: An integer does not fit, so it lies on no sensor.
+        CaptureError: An integer does not fit into 16 bits.
     """
     if np.issubdtype(stored.dtype, np.floating):
         return stored.astype(np.float32) if stored.dtype.itemsize < 4 else stored
@@ -103,12 +103,12 @@ def coordinates(stored: Stored, name: str, where: object) -> Stored:
 
 
 class ZippedColumn:
-    """One array of an npz archive, read piece by piece, so that it need not fit in memory.
+    """One array of an npz archive, read in parts, so that it need not fit in memory.
 
     Args:
         archive: The npz file.
-        name: Of the array's member, with `.npy`.
-        axes: How many the array must have: 2 for a table, whose rows are the pieces.
+        name: Name of the member, with `.npy`.
+        axes: Number of dimensions that the array must have: 1, or 2 for a table read by rows.
     """
 
     def __init__(self, archive: zipfile.ZipFile, name: str, axes: int = 1) -> None:
@@ -120,7 +120,12 @@ class ZippedColumn:
         elif version == (2, 0):
             header = np.lib.format.read_array_header_2_0(self._file)
         else:
-            raise CaptureError("unknown version of the npy format", where=where, got=version)
+            raise CaptureError(
+                "unknown version of the npy format",
+                where=where,
+                got=version,
+                do="save it with np.savez",
+            )
         self.shape, by_column, self.dtype = header
         if self.dtype.hasobject:
             raise CaptureError(
@@ -134,15 +139,16 @@ class ZippedColumn:
                 f"an event column must be a {dimensions} array of numbers",
                 where=where,
                 got=f"shape {self.shape}, {self.dtype}",
+                do="save each column as an array of its own",
             )
         self._start = self._file.tell()
         self._row = int(np.prod(self.shape[1:])) * self.dtype.itemsize
-        told, holds = self._start + len(self) * self._row, archive.getinfo(name).file_size
-        if told != holds:
+        stated, holds = self._start + len(self) * self._row, archive.getinfo(name).file_size
+        if stated != holds:
             raise CaptureError(
-                "array is shorter or longer than it says",
+                "array is shorter or longer than its header states",
                 where=where,
-                got=f"{holds} bytes instead of {told}",
+                got=f"{holds} bytes instead of {stated}",
                 do="the file may be damaged: copy or convert it again",
             )
 

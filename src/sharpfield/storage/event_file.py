@@ -1,4 +1,4 @@
-"""A file of events that is open but not loaded: any window of time, any part, chunk by chunk."""
+"""An open file of events that is read on demand: a time window, a range, or chunk by chunk."""
 
 import tokenize
 import zipfile
@@ -18,7 +18,7 @@ from sharpfield.core.events import EventStream, SiteColour, checked
 from sharpfield.storage.event_columns import Stored, coordinates, polarity, whole_us
 
 CHUNK = 2**20
-"""Events looked at together; bounds the memory of whatever goes through a file."""
+"""Events per chunk; bounds the memory of reading a file."""
 
 SEARCHED = 2**16
 """Times decompressed at once when searching for one: about one HDF5 chunk."""
@@ -30,12 +30,12 @@ UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, SyntaxError, tokenize.TokenError),
     *(zipfile.BadZipFile, zlib.error),
 )
-"""What reading a part of a damaged file may end in."""
+"""Exceptions that reading a part of a damaged file may raise."""
 
 
 @runtime_checkable
 class Column(Protocol):
-    """A one-dimensional array that is read piece by piece."""
+    """A one-dimensional array that is read in parts."""
 
     def __len__(self) -> int: ...
 
@@ -49,18 +49,18 @@ class EventFile:
     path: Path
     columns: Mapping[str, Column]
     unit: str | None
-    """Of the stored times: ns, us, ms or s. None where neither the file nor the caller says."""
+    """Unit of the stored times: ns, us, ms or s. None if neither file nor caller states it."""
     size: tuple[int, int] | None
-    """Width and height of the sensor in pixels; None where nobody says."""
+    """Sensor resolution, width and height; None if neither file nor caller states it."""
     offset_us: int = 0
-    """What stored times count from."""
+    """Origin of the stored times."""
     ms_to_idx: Column | None = None
     bayer: str = ""
     site_colour: SiteColour | None = None
     thresholds: tuple[float, float] | None = None
-    """Contrast thresholds (natural log) to darker and to brighter, where the file states them."""
+    """Contrast thresholds (natural log), negative and positive, where the file states them."""
     tracks: int = 1
-    """How many cameras there are; where several, the column `track` tells them apart."""
+    """Number of cameras; where there are several, the column `track` is the camera of an event."""
     resources: ExitStack = field(default_factory=ExitStack)
 
     def __enter__(self) -> "EventFile":
@@ -107,7 +107,7 @@ class EventFile:
         return self.part(self.first_at(start_us), self.first_at(end_us))
 
     def chunks(self, first: int = 0, last: int | None = None) -> Iterator[EventStream]:
-        """Consecutive events, `CHUNK` at a time, checked one by one and against each other.
+        """Consecutive events, `CHUNK` at a time, checked within and across chunks.
 
         Raises:
             CaptureError: See `core.events.checked`.
@@ -128,7 +128,7 @@ class EventFile:
             yield chunk
 
     def check(self) -> None:
-        """Look at every event once, in bounded memory.
+        """Read and check every event once, in bounded memory.
 
         Raises:
             CaptureError: See `core.events.checked`.
@@ -172,7 +172,7 @@ class EventFile:
         )
 
     def first_at(self, time_us: int) -> int:
-        """Number of the first event at or after a time; the count of events if there is none."""
+        """Index of the first event at or after a time; the number of events if there is none."""
         low, high = 0, len(self)
         if self.ms_to_idx is not None and len(self.ms_to_idx):
             ms = (time_us - self.offset_us) // 1000
@@ -190,7 +190,7 @@ class EventFile:
         return low + int(np.searchsorted(self._times(low, high), time_us))
 
     def stored(self, name: str, first: int, last: int) -> Stored:
-        """A part of a column as the file has it.
+        """A part of a column as the file stores it.
 
         Raises:
             CaptureError: It cannot be read.
@@ -208,7 +208,7 @@ class EventFile:
     def _times(self, first: int, last: int) -> Int64[np.ndarray, "n"]:
         if self.unit is None:
             raise CaptureError(
-                "the file does not say the unit of its event times",
+                "the file does not state the unit of its event times",
                 where=self.path,
                 do="give the unit: ns, us, ms or s",
             )
@@ -217,7 +217,7 @@ class EventFile:
     def _needed_size(self) -> tuple[int, int]:
         if self.size is None:
             raise CaptureError(
-                "the file does not say the size of its sensor",
+                "the file does not state its sensor resolution",
                 where=self.path,
                 do="give width and height in pixels",
             )

@@ -1,12 +1,11 @@
-"""Writing events in the format that a file's name asks for, in as many pieces as you like.
+"""Writing events in the format given by the suffix of a file name, chunk by chunk.
 
-    .h5     our own, see `storage.event_writer`: it says its units and its sensor
+    .h5     our own, see `storage.event_writer`: it states its units and sensor resolution
     .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
-    .csv    a header `t_us,x,y,p`, then an event per line; p is -1 or +1
+    .csv    a header `t_us,x,y,p`, then one event per line; p is -1 or +1
     .raw    Prophesee's EVT3, see `storage.evt_writer`
 
-Whatever the format, the file appears whole, at the end, or not at all, and memory is that of one
-piece.
+In every format the file appears whole, at the end, or not at all, and one chunk is in memory.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,19 +23,19 @@ from sharpfield.storage.event_writer import writing_events
 from sharpfield.storage.evt_writer import writing_evt
 
 Append = Callable[[EventStream], None]
-"""Takes events that come after all earlier ones."""
+"""Appends events that are later than all earlier ones."""
 
 
 @contextmanager
 def exporting_events(path: Path, like: EventStream) -> Iterator[Append]:
-    """What takes the events of a new file.
+    """A function that appends events to a new file.
 
     Args:
         path: Ends in .h5, .npz, .csv or .raw.
-        like: Any stream of the same sensor, it may be empty.
+        like: Any stream of the same sensor; it may be empty.
 
     Raises:
-        OptionError: The name has another ending.
+        OptionError: The name has another suffix.
     """
     expect_format(path)
     with FORMATS[path.suffix](path, like) as append:
@@ -44,10 +43,10 @@ def exporting_events(path: Path, like: EventStream) -> Iterator[Append]:
 
 
 def expect_format(path: Path) -> None:
-    """Make sure that events can be written to a file of this name.
+    """Check that the suffix of a file name is a format of events.
 
     Raises:
-        OptionError: They cannot.
+        OptionError: It is not.
     """
     if path.suffix not in FORMATS:
         raise OptionError(
@@ -73,8 +72,8 @@ def _arrays(path: Path, like: EventStream) -> Iterator[Append]:
 
         append(like[:0])
         yield append
-        alone = {name: np.array(told) for name, told in about.items()}
-        write_arrays(temporary, columns | alone)
+        numbers = {name: np.array(value) for name, value in about.items()}
+        write_arrays(temporary, columns | numbers)
 
 
 @contextmanager

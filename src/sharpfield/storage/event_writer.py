@@ -1,19 +1,17 @@
-"""Writing events: our superset of the DSEC layout, in as many pieces as you like.
+"""Writing events in our superset of the DSEC layout, chunk by chunk.
 
     events/{x, y, t, p}     t in us after t_offset, p 0 or 1; chunks of 65 536 events
-    events/track            which camera, where there are several
-    ms_to_idx               number of the first event at or after each ms since t_offset
+    events/track            the camera of an event, where there are several
+    ms_to_idx               index of the first event at or after each ms since t_offset
     t_offset                us
     site_colour/{x, y, channel}     only for rectified events of a colour sensor
     attributes              format, version, tick_ns, width, height, bayer, tracks
 
-Blosc (zstd 1, byte shuffle) packs 20 M real events at 1.7 bytes each and gives a random 10 ms
+Blosc (zstd 1, byte shuffle) compresses 20 M real events to 1.7 bytes each and reads a random 10 ms
 window in about 3 ms; without `hdf5plugin` it is gzip 1 with shuffle, which every HDF5 reads.
 
-Several files of our own, of events that follow each other, made one.
-
-Whoever writes a long recording writes it in parts, so that what is written stays when the writing
-is interrupted. The parts are joined without unpacking them: HDF5 chunks are copied as they are.
+A long recording is written in parts, which remain when writing is interrupted. `join_events` joins
+them without decompressing: HDF5 chunks are copied as they are.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,10 +31,10 @@ from sharpfield.storage.hdf5 import compression_plugin
 
 FORMAT, VERSION = "sharpfield-events", 1
 ROWS = 65_536
-"""Events in an HDF5 chunk: what is unpacked at once."""
+"""Events per HDF5 chunk, which are decompressed together."""
 
 SHORT_US = 2**32 - 1
-"""Longest recording (71 minutes) whose times fit in 4 bytes."""
+"""Longest recording (71 minutes) whose times fit into 4 bytes."""
 
 
 class EventWriter:
@@ -57,15 +55,15 @@ class EventWriter:
         self._offset_us = origin_us or 0
         self._last_us: int | None = None
         self._columns: dict[str, h5py.Dataset] = {}
-        self._marks = file.create_dataset(
-            "ms_to_idx", (0,), np.uint64, maxshape=(None,), chunks=(ROWS,), **_packing()
+        self._ms_to_idx = file.create_dataset(
+            MS_TO_IDX, (0,), np.uint64, maxshape=(None,), chunks=(ROWS,), **_compression()
         )
 
     def append(self, events: EventStream) -> None:
-        """Add events that come after all earlier ones.
+        """Append events that are later than all earlier ones.
 
         Raises:
-            CaptureError: They do not, or are unsound in themselves, or differ in their sensor.
+            CaptureError: They are earlier or invalid.
         """
         if not len(events):
             return
@@ -75,7 +73,7 @@ class EventWriter:
             self._begin(events)
         elif first < self._last_us:
             raise CaptureError(
-                "events to be appended begin before the last ones written",
+                "appended events begin before the last ones written",
                 where=self._path,
                 got=f"{first} us after {self._last_us} us",
                 do="append chunks in the order of time",
@@ -83,18 +81,19 @@ class EventWriter:
         since = events.t_us - self._offset_us
         if not self._long and since[-1] > SHORT_US:
             raise CaptureError(
-                "the recording is longer than announced",
+                "the recording is longer than `span_us`",
                 where=self._path,
                 got=f"{since[-1] / 6e7:.1f} minutes",
+                do="leave `span_us` out",
             )
         columns = {"x": events.x, "y": events.y, "t": since, "p": (events.p > 0).astype(np.uint8)}
         if events.track is not None:
             columns["track"] = events.track
         for name, values in columns.items():
             self._extend(self._columns[name], values)
-        known = len(self._marks)
-        marks = np.arange(known, since[-1] // 1000 + 1)
-        self._extend(self._marks, self._count + np.searchsorted(since, marks * 1000))
+        known = len(self._ms_to_idx)
+        ms = np.arange(known, since[-1] // 1000 + 1)
+        self._extend(self._ms_to_idx, self._count + np.searchsorted(since, ms * 1000))
         self._count += len(events)
         self._last_us = last
 
@@ -108,7 +107,7 @@ class EventWriter:
         self._file["t_offset"] = np.int64(self._offset_us)
 
     def _begin(self, events: EventStream) -> None:
-        """Make the columns, now that their types are known."""
+        """Create the columns, now that their types are known."""
         if self._origin_us is None:
             self._offset_us = int(events.t_us[0]) // 1000 * 1000
         kinds = {
@@ -121,7 +120,7 @@ class EventWriter:
             kinds["track"] = events.track.dtype
         for name, kind in kinds.items():
             self._columns[name] = self._file.create_dataset(
-                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_packing()
+                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_compression()
             )
 
     @staticmethod
@@ -142,11 +141,12 @@ def writing_events(
     """A writer for `path`; the file appears when the block ends well, whole, or not at all.
 
     Args:
-        path: Of the file, replaced if it exists.
-        like: Any stream of the same sensor (it may be empty): its size and colour are written.
-        span_us: Length of the recording, where it is known; a short one takes less memory to read.
-        origin_us: What stored times count from, not after the first event; by default the whole
-            ms before it.
+        path: The file, replaced if it exists.
+        like: Any stream of the same sensor (it may be empty): its resolution and colour filter
+            are written.
+        span_us: Duration of the recording, if known; times of a short one take 4 bytes.
+        origin_us: Origin of the stored times, not after the first event; by default the whole ms
+            before it.
     """
     path = Path(path)
     with replacing(path) as temporary:
@@ -177,23 +177,23 @@ def write_events(path: Path | str, events: EventStream) -> None:
             writer.append(events[first : first + CHUNK])
 
 
-def _packing() -> Mapping[str, Any]:
+def _compression() -> Mapping[str, Any]:
     plugin = compression_plugin()
     if plugin is not None:
         return plugin.Blosc(cname="zstd", clevel=1, shuffle=plugin.Blosc.SHUFFLE)
     return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
-MARKS = "ms_to_idx"
+MS_TO_IDX = "ms_to_idx"
 
 
 def join_events(path: Path, parts: Sequence[Path]) -> None:
-    """Write one file of several; it appears whole or not at all, and the parts stay.
+    """Join files of consecutive events; the new file appears whole or not at all.
 
     Args:
-        path: Of the file, replaced if it exists.
-        parts: At least one, in the order of time, all written with the same `origin_us` and
-            `span_us`; all but the last hold a multiple of `event_writer.ROWS` events.
+        path: The file, replaced if it exists.
+        parts: At least one file, in the order of time, all written with the same `origin_us` and
+            `span_us`; all but the last hold a multiple of `ROWS` events.
     """
     with ExitStack() as opened:
         files: list[Any] = [opened.enter_context(h5py.File(part, "r")) for part in parts]
@@ -205,10 +205,10 @@ def join_events(path: Path, parts: Sequence[Path]) -> None:
             joined.create_group("events")
             for name in files[0]["events"]:
                 _join_column(joined, name, [file["events"][name] for file in files])
-            for name in set(files[0]) - {"events", MARKS}:
+            for name in set(files[0]) - {"events", MS_TO_IDX}:
                 files[0].copy(name, joined)
             joined.create_dataset(
-                MARKS, data=_marks(files, counts), chunks=(ROWS,), maxshape=(None,)
+                MS_TO_IDX, data=_joined_ms_to_idx(files, counts), chunks=(ROWS,), maxshape=(None,)
             )
 
 
@@ -216,13 +216,13 @@ def _join_column(joined: h5py.File, name: str, columns: Sequence[h5py.Dataset]) 
     first = columns[0]
     total = sum(len(column) for column in columns)
     space = h5py.h5s.create_simple((total,), (h5py.h5s.UNLIMITED,))
-    packing = first.id.get_create_plist()  # chunks and filters, as they were packed
+    settings = first.id.get_create_plist()  # chunks and filters as in the parts
     made = h5py.h5d.create(
         joined["events"].id,
         name.encode(),
         first.id.get_type(),
         space,
-        packing,
+        settings,
     )
     base = 0
     for column in columns:
@@ -233,11 +233,11 @@ def _join_column(joined: h5py.File, name: str, columns: Sequence[h5py.Dataset]) 
         base += len(column)
 
 
-def _marks(files: Sequence[Any], counts: Sequence[int]) -> UInt64[np.ndarray, "m"]:
-    """Number of the first event at or after each ms: each part tells it for its own time."""
+def _joined_ms_to_idx(files: Sequence[Any], counts: Sequence[int]) -> UInt64[np.ndarray, "m"]:
+    """Index of the first event at or after each ms; each part has it for its own time."""
     known, base = [np.empty(0, np.uint64)], 0
     for file, count in zip(files, counts, strict=True):
-        told = sum(len(marks) for marks in known)
-        known.append(file[MARKS][told:] + np.uint64(base))
+        first_ms = sum(len(one) for one in known)
+        known.append(file[MS_TO_IDX][first_ms:] + np.uint64(base))
         base += count
     return np.concatenate(known)

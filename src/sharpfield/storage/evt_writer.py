@@ -1,8 +1,8 @@
-"""Writing events as a camera would: Prophesee's RAW files, EVT2 or EVT3, which their tools open.
+"""Writing Prophesee's RAW files, encoded as EVT2 or EVT3, which their tools open.
 
-Both hold whole pixels of one sensor of up to 2048 x 2048, and lose nothing of them. EVT3 takes 2
-to 3 bytes per event of a real recording, EVT2 4. Their clocks wrap (after 17 s and 5 hours): where
-the first event comes later than that, the header says from when on times count.
+Both store integer pixels of one sensor of up to 2048 x 2048 without loss. EVT3 takes 2 to 3 bytes
+per event of a real recording, EVT2 4. Their clocks wrap (after 17 s and 5 hours): where the first
+event is later than that, the header states the origin of times.
 
 Source: Prophesee, *EVT 2.0* and *EVT 3.0 format*, *RAW file format* (Metavision documentation).
 """
@@ -22,36 +22,36 @@ from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
 
 LARGEST = 2048
-"""Pixels in a row or column: their numbers have 11 bits."""
+"""Maximum width and height: coordinates have 11 bits."""
 
 WORDS = 2**20
-"""Words made at once."""
+"""Words per buffer."""
 
-ROOM = 8
-"""Most words that one event takes."""
+MOST_WORDS = 8
+"""Maximum number of words of one event."""
 
-HOP2, HOP3 = 2**20, 1
-"""How far the high part of the time goes in one word: some readers see a wrap of EVT3 only where
-no step is left out, as cameras do."""
+STEP2, STEP3 = 2**20, 1
+"""Maximum increase of the high part of the time per word: some readers detect a wrap of EVT3 only
+where no step is left out, as cameras do."""
 
-PAYS = 5
-"""Neighbours of one row and time that are shorter as a vector (four words) than one by one."""
+VECTOR_EVENTS = 5
+"""Minimum number of neighbours of one row and time that are written as a vector (four words)."""
 
 HIGH, LOW, ROW = range(3)
-"""What the last words said, -1 before the first."""
+"""Indices of the encoder's state: the values of the last words, -1 before the first."""
 
 Encode = Callable[..., Any]
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """One of Prophesee's ways to write events."""
+    """One of Prophesee's encodings of events."""
 
     header: str
     word: str
     encode: Encode
     period_us: int
-    """When its clock wraps."""
+    """Period after which its clock wraps."""
 
 
 class EvtWriter:
@@ -65,10 +65,10 @@ class EvtWriter:
         self._last_us: int | None = None
 
     def append(self, events: EventStream) -> None:
-        """Add events that come after all earlier ones.
+        """Append events that are later than all earlier ones.
 
         Raises:
-            CaptureError: They do not, or are unsound in themselves, or no whole pixels.
+            CaptureError: They are earlier or invalid, or have rectified positions.
         """
         if not len(events):
             return
@@ -79,7 +79,7 @@ class EvtWriter:
             self._begin(first)
         elif first < self._last_us:
             raise CaptureError(
-                "events to be appended begin before the last ones written",
+                "appended events begin before the last ones written",
                 where=self._path,
                 got=f"{first} us after {self._last_us} us",
                 do="append chunks in the order of time",
@@ -89,7 +89,7 @@ class EvtWriter:
         self._write(x, y, events.t_us - self._origin_us, events.p)
 
     def finish(self) -> None:
-        """Write the header, if no event came."""
+        """Write the header, if there was no event."""
         if self._last_us is None:
             self._begin(0)
 
@@ -122,13 +122,13 @@ def writing_evt(
     """A writer for `path`; the file appears when the block ends well, whole, or not at all.
 
     Args:
-        path: Of the file, replaced if it exists.
+        path: The file, replaced if it exists.
         like: Any stream of the same sensor (it may be empty).
         encoding: "evt2" or "evt3".
 
     Raises:
         OptionError: There is no such encoding.
-        CaptureError: The sensor is too large, or events are no whole pixels of one camera.
+        CaptureError: The sensor is too large, or events are not integer pixels of one camera.
     """
     path = Path(path)
     if encoding not in ENCODINGS:
@@ -144,17 +144,17 @@ def writing_evt(
 
 
 def _expect_plain(events: EventStream, path: Path) -> None:
-    """Make sure that events are whole pixels of one sensor that is not too large."""
+    """Check that events are integer pixels of one sensor that is not too large."""
     if events.rectified or events.tracks > 1:
         raise CaptureError(
-            "RAW files hold whole pixels of one camera",
+            "RAW files store integer pixels of one camera",
             where=path,
             got="rectified positions" if events.rectified else f"{events.tracks} cameras",
             do="write .h5 instead",
         )
     if max(events.width, events.height) > LARGEST:
         raise CaptureError(
-            f"RAW files hold sensors of up to {LARGEST} x {LARGEST} pixels",
+            f"RAW files store sensors of up to {LARGEST} x {LARGEST} pixels",
             where=path,
             got=f"{events.width} x {events.height}",
             do="write .h5 instead",
@@ -164,15 +164,15 @@ def _expect_plain(events: EventStream, path: Path) -> None:
 @njit(cache=True, nogil=True)
 @no_type_check
 def _encode_evt2(columns, first, state, words):
-    """EVT2 of the events from `first` on; which one is next, and how many words there are."""
+    """Encode events from `first` on as EVT2; returns the next event and the number of words."""
     x, y, t, p = columns
     count = 0
     i = first
-    while i < t.size and count + ROOM <= words.size:
+    while i < t.size and count + MOST_WORDS <= words.size:
         high = t[i] >> 6
         if high != state[HIGH]:
-            ahead = high - state[HIGH]
-            state[HIGH] = high if state[HIGH] < 0 else state[HIGH] + min(ahead, HOP2)
+            increase = high - state[HIGH]
+            state[HIGH] = high if state[HIGH] < 0 else state[HIGH] + min(increase, STEP2)
             words[count] = 0x80000000 | (state[HIGH] & 0xFFFFFFF)
             count += 1
             continue
@@ -189,11 +189,11 @@ def _encode_evt3(columns, first, state, words):
     x, y, t, p = columns
     count = 0
     i = first
-    while i < t.size and count + ROOM <= words.size:
+    while i < t.size and count + MOST_WORDS <= words.size:
         high, low = t[i] >> 12, t[i] & 0xFFF
         if high != state[HIGH]:
-            ahead = high - state[HIGH]
-            state[HIGH] = high if state[HIGH] < 0 else state[HIGH] + min(ahead, HOP3)
+            increase = high - state[HIGH]
+            state[HIGH] = high if state[HIGH] < 0 else state[HIGH] + min(increase, STEP3)
             state[LOW] = -1
             words[count] = 0x8000 | (state[HIGH] & 0xFFF)
             count += 1
@@ -206,7 +206,7 @@ def _encode_evt3(columns, first, state, words):
             words[count] = y[i]
             state[ROW] = y[i]
             count += 1
-        bright = (p[i] > 0) << 11
+        polarity = (p[i] > 0) << 11
         group = x[i] >> 5
         mask = 0
         j = i
@@ -215,15 +215,15 @@ def _encode_evt3(columns, first, state, words):
                 break
             mask |= 1 << (x[j] & 31)
             j += 1
-        if j - i >= PAYS:
-            words[count] = 0x3000 | bright | group << 5
+        if j - i >= VECTOR_EVENTS:
+            words[count] = 0x3000 | polarity | group << 5
             words[count + 1] = 0x4000 | (mask & 0xFFF)
             words[count + 2] = 0x4000 | (mask >> 12 & 0xFFF)
             words[count + 3] = 0x5000 | mask >> 24
             count += 4
             i = j
         else:
-            words[count] = 0x2000 | bright | x[i]
+            words[count] = 0x2000 | polarity | x[i]
             count += 1
             i += 1
     return i, count

@@ -26,7 +26,7 @@ from sharpfield.storage.disk_cache import cache_folder, cache_key, cached
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 Alpha = Literal["drop", "white"]
-"""What to do with an alpha channel: drop it, or lay the image on white."""
+"""What to do with an alpha channel: drop it, or composite the image on white."""
 
 Image = UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"]
 Images = UInt8[np.ndarray, "n h w c"] | UInt16[np.ndarray, "n h w c"]
@@ -41,7 +41,7 @@ IN_MEMORY = 256_000_000
 def list_images(folder: Path) -> list[Path]:
     """Images in a folder, sorted by name; files whose name starts with a dot are left out."""
     if not folder.is_dir():
-        raise CaptureError("image folder not found", where=folder)
+        raise CaptureError("image folder not found", where=folder, do="check the path")
     return sorted(
         path
         for path in folder.iterdir()
@@ -62,7 +62,7 @@ def read_image(path: Path, *, alpha: Alpha = "drop") -> Image:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        raise CaptureError("image not found", where=path) from None
+        raise CaptureError("image not found", where=path, do="check the path") from None
     if not _ends_well(data):
         raise CaptureError(
             "image file is truncated", where=path, got=f"{len(data)} bytes", do="copy it again"
@@ -71,7 +71,9 @@ def read_image(path: Path, *, alpha: Alpha = "drop") -> Image:
     if pixels is None:
         raise CaptureError("cannot decode image", where=path, do="use PNG or JPEG")
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise CaptureError("images must have 8 or 16 bits", where=path, got=pixels.dtype)
+        raise CaptureError(
+            "images must have 8 or 16 bits", where=path, got=pixels.dtype, do="convert them"
+        )
     if pixels.ndim == 2:
         return pixels[..., None]
     rgb = np.ascontiguousarray(pixels[..., 2::-1])
@@ -111,7 +113,7 @@ def image_stack(
         CaptureError: There are none, one cannot be read, or they differ in shape or type.
     """
     if not items:
-        raise CaptureError("there are no images to read")
+        raise CaptureError("there are no images to read", do="add PNG or JPEG files")
     first = decode(items[0])
     shape = (len(items), *first.shape)
     if sources and first.nbytes * len(items) > in_memory:
@@ -178,7 +180,7 @@ def _on_white(
 
 
 def _ends_well(data: bytes) -> bool:
-    """Whether a PNG or JPEG has its end marker; decoders fill what is missing with grey."""
+    """Whether a PNG or JPEG has its end marker; decoders fill missing parts with grey."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" in data[-64:]
     if data.startswith(b"\xff\xd8"):

@@ -1,8 +1,8 @@
-"""PLY files: one row of numbers for each vertex, under names that the header gives.
+"""PLY files: one row of numbers for each vertex, with the property names of the header.
 
-What is read: `ascii`, `binary_little_endian` and `binary_big_endian`, with the vertices as first
-element and without lists in them; whatever follows (faces) is left alone. What is written is
-binary, little endian. A *row* is a numpy structure with a field for each property.
+Reading supports `ascii`, `binary_little_endian` and `binary_big_endian`, with the vertices as first
+element and without list properties; what follows (faces) is ignored. Files are written in binary,
+little endian. A *row* is a numpy structure with a field for each property.
 
 Source: Greg Turk, "The PLY polygon file format" (1994).
 """
@@ -23,15 +23,15 @@ TYPES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
-"""Both sets of names that are in use."""
+"""numpy types by both sets of names in use."""
 
 NAMES = {code: name for name, code in reversed(TYPES.items())}
-"""The older names: every program knows them."""
+"""The older names, which every program supports."""
 
 ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 LONGEST_HEADER = 65_536
-"""Bytes; what has no end by then is something else."""
+"""Maximum header length in bytes."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class _Header:
 
 
 def read_ply(path: Path) -> Ply:
-    """Read the vertices of a file, in the machine's byte order.
+    """Read the vertices of a file, in native byte order.
 
     Raises:
         CaptureError: The file is missing, truncated, or not a PLY file of plain vertices.
     """
     if not path.is_file():
-        raise CaptureError("file not found", where=path)
+        raise CaptureError("file not found", where=path, do="check the path")
     with path.open("rb") as file:
         header = _header(file, path)
         order = ORDERS[header.kind]
@@ -91,10 +91,10 @@ def write_ply(path: Path, ply: Ply) -> None:
 
 
 def columns(ply: Ply, names: Sequence[str], *, where: object) -> Shaped[np.ndarray, "n m"]:
-    """Some properties side by side.
+    """Some properties as the columns of one array.
 
     Raises:
-        CaptureError: The file does not have them.
+        CaptureError: The file lacks one of them.
     """
     present = ply.rows.dtype.names or ()
     if missing := [name for name in names if name not in present]:
@@ -102,6 +102,7 @@ def columns(ply: Ply, names: Sequence[str], *, where: object) -> Shaped[np.ndarr
             f"vertices have no {', '.join(missing[:4])}",
             where=where,
             got=", ".join(present[:12]) + (", ..." if len(present) > 12 else ""),
+            do="write these properties",
         )
     if not names:
         return np.zeros((len(ply.rows), 0), np.float32)
@@ -115,8 +116,8 @@ def _header(file: BinaryIO, path: Path) -> _Header:
         match words:
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as kind, _]:
                 pass
-            case ["comment", *said]:
-                comments.append(" ".join(said))
+            case ["comment", *words_of_comment]:
+                comments.append(" ".join(words_of_comment))
             case ["obj_info", *_]:
                 pass
             case ["element", name, number] if number.isdecimal() and (element or name == "vertex"):
@@ -137,7 +138,7 @@ def _header(file: BinaryIO, path: Path) -> _Header:
 
 def _header_lines(file: BinaryIO, path: Path) -> list[str]:
     if file.readline(8).strip() != b"ply":
-        raise CaptureError("not a PLY file", where=path, do="name a .ply file")
+        raise CaptureError("not a PLY file", where=path, do="give a .ply file")
     lines: list[str] = []
     while file.tell() < LONGEST_HEADER:
         line = file.readline(LONGEST_HEADER)
@@ -163,7 +164,10 @@ def _from_text(
     except ValueError:
         odd = (b" ".join(line).decode(errors="replace") for line in lines if len(line) != wanted)
         raise CaptureError(
-            "cannot read the numbers of a PLY file", where=path, got=next(odd, "no numbers")
+            "cannot read the numbers of a PLY file",
+            where=path,
+            got=next(odd, "no numbers"),
+            do="write it again",
         ) from None
     for name, values in zip(row.names or (), table.T, strict=True):
         rows[name] = values
@@ -175,7 +179,7 @@ def _unknown(path: Path, got: str) -> CaptureError:
         "cannot read the header of a PLY file",
         where=path,
         got=got,
-        do="vertices come first, and each property of theirs is a single number",
+        do="the first element must be vertices, and each property a single number",
     )
 
 

@@ -1,10 +1,10 @@
-"""Gaussians as the `.ply` files that viewers of splats read.
+"""3D Gaussians in the `.ply` layout that splat viewers read.
 
-Vertices have the place `x y z`, an unused normal `nx ny nz`, harmonics of degree 0 `f_dc_0..2`,
-the higher ones `f_rest_*` (all of red, then of green, then of blue), the log odds of the `opacity`,
-the natural log of the scales `scale_0..2` and a quaternion `rot_0..3` (w x y z). Harmonics carry
-the Condon-Shortley phase, so those of odd order m have the opposite sign of ours. Degree 0 means
-0.5 + 0.282 f_dc.
+Vertices have the position `x y z`, an unused normal `nx ny nz`, spherical harmonics (SH) of degree
+0 `f_dc_0..2`, higher ones `f_rest_*` (all of red, then green, then blue), the logit of the
+`opacity`, the natural log of the scales `scale_0..2` and a quaternion `rot_0..3` (w x y z). The SH
+include the Condon-Shortley phase, so those of odd order m have the opposite sign of ours. The
+colour of degree 0 is 0.5 + 0.282 f_dc.
 
 Source: released code of "3D Gaussian splatting for real-time radiance field rendering" (SIGGRAPH
 2023), which made this layout.
@@ -21,18 +21,18 @@ from jaxtyping import Float32
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.ply import Ply, columns, read_ply, write_ply
 
-PLACE, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
+POSITION, NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
 BASE = tuple(f"f_dc_{i}" for i in range(3))
 SCALES = tuple(f"scale_{i}" for i in range(3))
-TURN = tuple(f"rot_{i}" for i in range(4))
+ROTATION = tuple(f"rot_{i}" for i in range(4))
 
 COUNTS = [3 * ((degree + 1) ** 2 - 1) for degree in range(4)]
-"""How many higher harmonics there may be, of three colours, for degrees 0 to 3."""
+"""Number of higher SH coefficients of three colours, for degrees 0 to 3."""
 
 
 @dataclass(frozen=True)
 class SplatTable:
-    """Gaussians as such files hold them, but with our signs and order of harmonics."""
+    """Gaussians as in such files, but with our signs and order of SH coefficients."""
 
     means: Float32[np.ndarray, "n 3"]
     quaternions: Float32[np.ndarray, "n 4"]
@@ -48,7 +48,7 @@ class SplatTable:
 
 
 def write_splats(path: Path, splats: SplatTable) -> None:
-    """Write Gaussians of degree 0 to 3; the file appears whole or not at all."""
+    """Write Gaussians of SH degree 0 to 3; the file appears whole or not at all."""
     count, k, _ = splats.harmonics.shape
     harmonics = splats.harmonics * _signs(k)
     higher = harmonics[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (k - 1))
@@ -64,7 +64,7 @@ def write_splats(path: Path, splats: SplatTable) -> None:
         ],
         -1,
     )
-    names = [*PLACE, *NORMAL, *BASE, *_higher(higher.shape[1]), "opacity", *SCALES, *TURN]
+    names = [*POSITION, *NORMAL, *BASE, *_higher(higher.shape[1]), "opacity", *SCALES, *ROTATION]
     rows = np.ascontiguousarray(values).view([(name, "f4") for name in names])[:, 0]
     write_ply(path, Ply(rows, splats.comments))
 
@@ -80,25 +80,28 @@ def read_splats(path: Path) -> SplatTable:
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if count not in COUNTS:
         raise CaptureError(
-            "Gaussians with an odd number of harmonics",
+            "unexpected number of SH coefficients",
             where=path,
             got=f"{count} properties f_rest_*",
-            do=f"there are {', '.join(map(str, COUNTS[:-1]))} or {COUNTS[-1]}, by their degree",
+            do=f"there must be {', '.join(map(str, COUNTS[:-1]))} or {COUNTS[-1]}, by degree",
         )
 
     def read(wanted: tuple[str, ...]) -> Float32[np.ndarray, "n m"]:
         values = columns(ply, wanted, where=path).astype(np.float32)
         if not np.isfinite(values).all():
             raise CaptureError(
-                "Gaussians that are not finite", where=path, got=f"in {', '.join(wanted[:3])}"
+                "Gaussians are not finite",
+                where=path,
+                got=f"in {', '.join(wanted[:3])}",
+                do="export them again",
             )
         return values
 
     higher = read(_higher(count)).reshape(len(ply.rows), 3, count // 3).transpose(0, 2, 1)
     harmonics = np.concatenate([read(BASE)[:, None], higher], 1)
     return SplatTable(
-        means=read(PLACE),
-        quaternions=read(TURN),
+        means=read(POSITION),
+        quaternions=read(ROTATION),
         log_scales=read(SCALES),
         opacity_logits=read(("opacity",))[:, 0],
         harmonics=harmonics * _signs(harmonics.shape[1]),

@@ -306,7 +306,7 @@ def test_events_of_another_tool_may_need_their_unit(panning, tmp_path):
     with h5py.File(tmp_path / "events.h5", "w") as file:
         file["x"], file["y"], file["p"] = events.x, events.y, events.p
         file["t"] = events.t_us * 1000
-    with pytest.raises(CaptureError, match="does not say the unit"):
+    with pytest.raises(CaptureError, match="does not state the unit"):
         native.read(tmp_path)
     text = (tmp_path / "capture.toml").read_text()
     (tmp_path / "capture.toml").write_text(text + '[events]\nunit = "us"\n')

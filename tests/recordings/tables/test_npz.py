@@ -139,7 +139,7 @@ def test_no_events_at_all(tmp_path):
 
 def test_the_unit_is_asked_for_with_what_each_would_mean(tmp_path):
     path = saved(tmp_path / "e.npz", np.savez, **columns())
-    with pytest.raises(CaptureError, match="does not say the unit") as caught:
+    with pytest.raises(CaptureError, match="does not state the unit") as caught:
         open_npz(path, ReaderOptions(size=SIZE))
     assert "0.08" in str(caught.value) and "s if us" in str(caught.value)
     with pytest.raises(CaptureError, match="size of its sensor"):
@@ -148,7 +148,7 @@ def test_the_unit_is_asked_for_with_what_each_would_mean(tmp_path):
 
 def test_a_folder_of_other_names_does_not_say_its_unit(tmp_path):
     np.savez(tmp_path / "seq1.npz", **columns())
-    with pytest.raises(CaptureError, match="does not say the unit"):
+    with pytest.raises(CaptureError, match="does not state the unit"):
         open_npz_folder(tmp_path, ReaderOptions(size=SIZE))
 
 

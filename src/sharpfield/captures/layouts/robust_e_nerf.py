@@ -14,7 +14,7 @@ left out, with a note.
 Source: Low and Lee, *Robust e-NeRF* (ICCV 2023), and its data loader.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +33,15 @@ from sharpfield.captures.layouts.nerfstudio import estimated_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.events import EventStream, checked
+from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.lenses import PINHOLE, lens_in_calibration
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Tracks
 from sharpfield.storage.arrays import load_arrays
-from sharpfield.storage.event_columns import coordinates, polarity, whole_us
+from sharpfield.storage.event_cache import read_events
+from sharpfield.storage.event_columns import whole_us
+from sharpfield.storage.event_layouts import open_events
 from sharpfield.storage.images import SUFFIXES, read_images
 
 EVENTS, POSES, CALIBRATION = "raw_events.npz", "camera_poses.npz", "camera_calibration.npz"
@@ -138,25 +140,8 @@ def _trajectory(path: Path) -> Stamped:
 
 
 def _events(path: Path, camera: Camera, bayer: str) -> EventStream:
-    found = _arrays(path, ("position", "timestamp", "polarity"))
-    position = found["position"]
-    if position.ndim != 2 or position.shape[1] != 2:
-        raise CaptureError(
-            "positions of events must be pairs",
-            where=path,
-            got=f"shape {position.shape}",
-            do="store `position` as [n, 2]: x, y",
-        )
-    events = EventStream(
-        x=coordinates(np.ascontiguousarray(position[:, 0]), "x", path),
-        y=coordinates(np.ascontiguousarray(position[:, 1]), "y", path),
-        t_us=whole_us(found["timestamp"], "ns", path),
-        p=polarity(found["polarity"], path),
-        width=camera.width,
-        height=camera.height,
-        bayer=bayer,
-    )
-    return checked(events, path)
+    with open_events(path, size=camera.size) as file:
+        return read_events(replace(file, bayer=bayer))
 
 
 def _known(calibration: Arrays) -> Known:

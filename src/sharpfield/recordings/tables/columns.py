@@ -136,7 +136,7 @@ def _expect_unit(file: EventFile) -> None:
         f"{(last - first) * UNITS[unit] / 1e6:.4g} s if {unit}" for unit in ("ns", "us", "ms", "s")
     )
     raise CaptureError(
-        "the file does not say the unit of its event times",
+        "the file does not state the unit of its event times",
         where=file.path,
         got=f"{first} to {last}, which is {lasts}",
         do="give the unit: ns, us, ms or s",
@@ -146,7 +146,7 @@ def _expect_unit(file: EventFile) -> None:
 def _expect_size(file: EventFile) -> None:
     if file.size is None:
         raise CaptureError(
-            "the file does not say the size of its sensor",
+            "the file does not state its sensor resolution",
             where=file.path,
             do="give width and height in pixels",
         )

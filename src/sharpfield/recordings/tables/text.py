@@ -179,7 +179,7 @@ def _unit(time: str, path: Path) -> str:
     if not time or re.search("[.eE]", time):
         return "s"
     raise CaptureError(
-        "the text does not say the unit of its times",
+        "the text does not state the unit of its times",
         where=path,
         got=f"the first is {time}",
         do=f"give the unit: one of {', '.join(UNITS)}",
