@@ -38,9 +38,9 @@ def test_it_is_the_network_of_the_paper():
 def test_nothing_is_looked_up():
     field, time = MLPField(generator=made(), width=4, depth=2), torch.zeros(5)
     old, new = torch.randn(5, 7, 3), torch.randn(5, 2, 3)
-    looked = field.look(old, time)
-    assert looked.shape == (5, 7, 0)
-    assert field.look_closer(looked, old, new, time).shape == (5, 9, 0)
+    features = field.coarse_features(old, time)
+    assert features.shape == (5, 7, 0)
+    assert field.fine_features(features, old, new, time).shape == (5, 9, 0)
     assert field.planes() == field.lines() == []
 
 

@@ -60,11 +60,11 @@ def test_the_box_ends_at_the_centres_of_the_outer_cells():
 def test_looking_closer_is_looking_everywhere_in_both_volumes():
     made_field, time = field(), torch.zeros(6)
     old, new = places(6, 7), places(6, 4) + 0.01
-    looked = made_field.look(old, time)
-    found = made_field.look_closer(looked, old, new, time)
+    features = made_field.coarse_features(old, time)
+    found = made_field.fine_features(features, old, new, time)
     both = torch.cat([old, new], 1)
     wanted = torch.cat([made_field.volumes[0](both), made_field.volumes[1](both)], -1)
-    torch.testing.assert_close(looked, made_field.volumes[0](old))
+    torch.testing.assert_close(features, made_field.volumes[0](old))
     torch.testing.assert_close(found, wanted)
 
 
@@ -92,15 +92,15 @@ def test_golden_sizes():
 
 
 @pytest.mark.parametrize(
-    ("looked", "size", "golden"),
+    ("features", "size", "golden"),
     [(32, COARSE, 14_080), (64, FINE, 171_520)],
     ids=["coarse", "fine"],
 )
-def test_multiplications(looked: int, size: HeadSize, golden: int):
+def test_multiplications(features: int, size: HeadSize, golden: int):
     """As published, less the direction's part, which is worked out once per ray."""
-    head, samples = PlaneHead(looked, size, generator=made()), 128
+    head, samples = PlaneHead(features, size, generator=made()), 128
     with FlopCounterMode(display=False) as counter:
-        _, hidden = head.density(torch.zeros(1, samples, looked), torch.zeros(1, samples, 3))
+        _, hidden = head.density(torch.zeros(1, samples, features), torch.zeros(1, samples, 3))
         head.colour(head.feature(hidden), torch.zeros(1, 3))
     direction = 27 * size.colour
     wanted = samples * golden - (samples - 1) * direction
@@ -108,12 +108,12 @@ def test_multiplications(looked: int, size: HeadSize, golden: int):
 
 
 def test_a_head_is_its_plain_formulation():
-    head, looked, points = field().coarse, torch.randn(6, 7, 5), places(6, 7)
+    head, features, points = field().coarse, torch.randn(6, 7, 5), places(6, 7)
     direction = torch.nn.functional.normalize(torch.randn(6, 3), dim=-1)
-    raw, hidden = head.density(looked, points)
+    raw, hidden = head.density(features, points)
     colour = head.colour(head.feature(hidden), direction)
 
-    x = torch.cat([looked, frequencies(points, 3)], -1)
+    x = torch.cat([features, frequencies(points, 3)], -1)
     first, second = head.inside.weight, head.out.weight
     out = torch.relu(x @ first.T) @ second.T
     toward = frequencies(direction, 2)[:, None].expand(-1, 7, -1)
@@ -126,8 +126,8 @@ def test_a_head_is_its_plain_formulation():
 
 def test_half_precision_is_near_and_ends_in_float32():
     exact, rough = field().fine, field(precision=torch.bfloat16).fine
-    looked, points, direction = torch.randn(6, 7, 10), places(6, 7), torch.randn(6, 3)
-    (raw, hidden), (raw16, hidden16) = (head.density(looked, points) for head in (exact, rough))
+    features, points, direction = torch.randn(6, 7, 10), places(6, 7), torch.randn(6, 3)
+    (raw, hidden), (raw16, hidden16) = (head.density(features, points) for head in (exact, rough))
     colour, colour16 = (
         head.colour(head.feature(seen), direction)
         for head, seen in ((exact, hidden), (rough, hidden16))
@@ -144,21 +144,21 @@ def test_gradients_of_a_volume():
     parameters = tuple(volume.parameters())
     names = [name for name, _ in volume.named_parameters()]
 
-    def look(point: Tensor, *values: Tensor) -> Tensor:
+    def coarse_features(point: Tensor, *values: Tensor) -> Tensor:
         return torch.func.functional_call(volume, dict(zip(names, values, strict=True)), (point,))
 
     with _dispatch.using("reference"):
-        assert torch.autograd.gradcheck(look, (point, *parameters))
+        assert torch.autograd.gradcheck(coarse_features, (point, *parameters))
 
 
 def test_every_parameter_of_a_field_learns():
     made_field, time = field(), torch.zeros(6)
     old, new, direction = places(6, 50), places(6, 50), torch.randn(6, 3)
-    looked = made_field.look(old, time)
-    close = made_field.look_closer(looked, old, new, time)
+    features = made_field.coarse_features(old, time)
+    close = made_field.fine_features(features, old, new, time)
     total = torch.zeros(())
     for head, seen, points in (
-        (made_field.coarse, looked, old),
+        (made_field.coarse, features, old),
         (made_field.fine, close, torch.cat([old, new], 1)),
     ):
         raw, hidden = head.density(seen, points)
@@ -177,6 +177,6 @@ def test_planes_and_lines_are_all_of_the_grids():
 
 def test_no_points():
     made_field, none = field(), torch.zeros(0)
-    looked = made_field.look(torch.zeros(0, 7, 3), none)
-    assert looked.shape == (0, 7, 5)
-    assert made_field.coarse.density(looked, torch.zeros(0, 7, 3))[0].shape == (0, 7)
+    features = made_field.coarse_features(torch.zeros(0, 7, 3), none)
+    assert features.shape == (0, 7, 5)
+    assert made_field.coarse.density(features, torch.zeros(0, 7, 3))[0].shape == (0, 7)

@@ -77,15 +77,15 @@ def test_a_field_is_looked_at_where_points_came_from(kind: str):
 
     warped, time = Warped(field, away), torch.ones(3)
     old, new = points(), points(3, 4) + 0.05
-    seen = warped.look(old, time)
-    expected = field.look(old + shift, time)
+    seen = warped.coarse_features(old, time)
+    expected = field.coarse_features(old + shift, time)
     for mine, theirs in zip(
         warped.coarse.density(seen, old), field.coarse.density(expected, old + shift), strict=True
     ):
         torch.testing.assert_close(mine, theirs)
-    closer = warped.look_closer(seen, old, new, time)
+    closer = warped.fine_features(seen, old, new, time)
     both = torch.cat([old, new], -2)
-    truly = field.look_closer(expected, old + shift, new + shift, time)
+    truly = field.fine_features(expected, old + shift, new + shift, time)
     found, hidden = warped.fine.density(closer, both)
     wanted, _ = field.fine.density(truly, both + shift)
     torch.testing.assert_close(found, wanted)
@@ -97,6 +97,6 @@ def test_a_field_is_looked_at_where_points_came_from(kind: str):
 def test_gradients_reach_the_deformation():
     field = MLPField(generator=made(), width=8, depth=4)
     warped = Warped(field, Deformation(generator=made(), width=8))
-    seen = warped.look(points(), torch.ones(3))
+    seen = warped.coarse_features(points(), torch.ones(3))
     warped.coarse.density(seen, points())[0].sum().backward()
     assert all(p.grad is not None and p.grad.any() for p in warped.deformation.parameters())

@@ -14,7 +14,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.protocols import Growing, Model
 from sharpfield.core.rays import Rays, Views
 from sharpfield.evaluation.event_scores import HasLogLight
-from sharpfield.geometry.normalise import centred
+from sharpfield.geometry.normalise import recentred
 from sharpfield.initialisation.static_points import backdrop
 from sharpfield.initialisation.visual_hull import box_cells, moving_cells
 from sharpfield.recipes.splat import DynamicSplat, EvDynamicSplat
@@ -148,7 +148,7 @@ def test_views_of_different_times_are_drawn_each_at_its_own():
 
 def test_moving_ones_start_where_something_moves():
     """The hub of the rotor is at the origin, which frames alone always see it cover."""
-    capture, _ = centred(tiny_moving())
+    capture, _ = recentred(tiny_moving())
     by_events = moving_cells(capture, event_index(capture.needed_events), (0.3, 0.7))
     assert by_events is not None and by_events.norm(dim=-1).min() < 0.1
     by_frames = moving_cells(capture, None, (0.3, 0.7))
@@ -160,7 +160,7 @@ def test_moving_ones_start_where_something_moves():
 
 
 def test_the_backdrop_is_what_cameras_see_most_of_the_time():
-    capture, _ = centred(tiny_moving())
+    capture, _ = recentred(tiny_moving())
     images = backdrop(capture)
     frames = capture.needed_frames
     tracks = np.unique(frames.track[capture.split.train])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sharpfield.fields.voxels import VoxelSizes
-from sharpfield.geometry.normalise import centred
+from sharpfield.geometry.normalise import recentred
 from sharpfield.initialisation.visual_hull import silhouettes, visual_hull
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
 from sharpfield.recipes.volume.voxel_scene import MovingOptions
@@ -108,7 +108,7 @@ def puppet():
     """32x32 pixels, four cameras to learn from, one held out."""
     timing = replace(MOVING_TIMING, frames=9, interval_us=125_000, step_us=12_500)
     rig = replace(MOVING_RIG, size=(32, 32))
-    return centred(simulate_moving("puppet", ring(4, held_out=1), rig=rig, timing=timing))
+    return recentred(simulate_moving("puppet", ring(4, held_out=1), rig=rig, timing=timing))
 
 
 def test_the_hull_holds_what_moves(puppet):
@@ -144,7 +144,7 @@ def test_no_hull_without_cameras_that_stand_still():
     carried = simulate_moving(
         "glider", hand_held(), rig=replace(MOVING_RIG, size=(12, 12)), timing=timing
     )
-    capture, _ = centred(carried)
+    capture, _ = recentred(carried)
     assert visual_hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
     field = SMALL.build(carried, 0).scene.field
     assert all((rows >= 0).all() for rows in field.rows)

@@ -28,7 +28,7 @@ class SlabHead(nn.Module):
         self.light = nn.Parameter(torch.tensor(colour))
         self.begin, self.end = begin, end
 
-    def density(self, looked: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+    def density(self, features: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         inside = (points[..., 2] > self.begin) & (points[..., 2] < self.end)
         return self.density_inside * inside, points
 
@@ -47,10 +47,10 @@ class Slab(nn.Module):
         self.coarse = SlabHead((1.0, 0.0, 0.0), begin, end)
         self.fine = SlabHead((0.2, 0.5, 0.8), begin, end)
 
-    def look(self, points: Tensor, time: Tensor) -> Tensor:
+    def coarse_features(self, points: Tensor, time: Tensor) -> Tensor:
         return points[..., :0]
 
-    def look_closer(self, looked: Tensor, old: Tensor, new: Tensor, time: Tensor) -> Tensor:
+    def fine_features(self, features: Tensor, old: Tensor, new: Tensor, time: Tensor) -> Tensor:
         return torch.cat([old, new], -2)[..., :0]
 
 

@@ -8,7 +8,12 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import HeadSize, PlaneHead
 from sharpfield.ops.encoding import frequencies
 from sharpfield.rendering import head_compositing as module
-from sharpfield.rendering.head_compositing import Compositing, Found, Work, composite_head
+from sharpfield.rendering.head_compositing import (
+    Compositing,
+    RayPoints,
+    RenderedRays,
+    composite_head,
+)
 
 RAYS, SAMPLES, LOOKED = 11, 24, 5
 HOWS = {
@@ -23,7 +28,7 @@ def head() -> PlaneHead:
     return PlaneHead(LOOKED, HeadSize(16, 6, 16), generator=generator(0, 0, "head"))
 
 
-def work(rays: int = RAYS, *, ordered: bool = False, noisy: bool = False) -> Work:
+def work(rays: int = RAYS, *, ordered: bool = False, noisy: bool = False) -> RayPoints:
     """Random rays; points lie in a random order, unless `ordered`."""
     made = generator(0, 0, "work")
 
@@ -32,7 +37,7 @@ def work(rays: int = RAYS, *, ordered: bool = False, noisy: bool = False) -> Wor
 
     z = torch.rand(rays, SAMPLES, generator=made).sort(-1).values
     order = torch.rand(rays, SAMPLES, generator=made).argsort(-1)
-    return Work(
+    return RayPoints(
         3 * normal(rays, SAMPLES, LOOKED),
         normal(rays, SAMPLES, 3),
         z,
@@ -43,15 +48,15 @@ def work(rays: int = RAYS, *, ordered: bool = False, noisy: bool = False) -> Wor
     )
 
 
-def plain(head: PlaneHead, work: Work, how: Compositing) -> Found:
+def plain(head: PlaneHead, work: RayPoints, how: Compositing) -> RenderedRays:
     """Sorted before the networks, the direction repeated for every sample, one loop per sample."""
-    looked, points = work.looked, work.points
+    features, points = work.features, work.points
     if work.order is not None:
         order = work.order[..., None]
-        looked = looked.gather(1, order.expand_as(looked))
+        features = features.gather(1, order.expand_as(features))
         points = points.gather(1, order.expand_as(points))
     first, second = head.inside.weight, head.out.weight
-    out = torch.relu(torch.cat([looked, frequencies(points, 10)], -1) @ first.T) @ second.T
+    out = torch.relu(torch.cat([features, frequencies(points, 10)], -1) @ first.T) @ second.T
     raw, feature = out[..., 0], out[..., 1:]
     toward = frequencies(work.direction, 4)[:, None].expand(-1, SAMPLES, -1)
     joined = torch.cat([head.first.of_sample, head.first.of_ray], 1)
@@ -74,10 +79,10 @@ def plain(head: PlaneHead, work: Work, how: Compositing) -> Found:
     rgb = (weights[..., None] * colour).sum(1)
     if not how.opaque_end:
         rgb = rgb + how.background * (1 - weights.sum(-1, keepdim=True))
-    return Found(rgb, (weights * work.z).sum(-1), weights.sum(-1), weights, feature)
+    return RenderedRays(rgb, (weights * work.z).sum(-1), weights.sum(-1), weights, feature)
 
 
-def pulled(found: Found) -> Tensor:
+def pulled(found: RenderedRays) -> Tensor:
     """A number that everything found has a say in."""
     made = generator(0, 0, "pull")
     values = [found.rgb, found.depth, found.opacity, found.weights, found.feature]
@@ -100,10 +105,10 @@ def test_it_is_the_plain_formulation(how: Compositing, chunk: int, noisy: bool, 
     results = []
     for render in (plain, composite_head):
         network, given = head(), work(noisy=noisy)
-        looked = given.looked.requires_grad_()
+        features = given.features.requires_grad_()
         more = {"keep_feature": True} if render is composite_head else {}
         found = render(network, given, how, **more)
-        gradients = torch.autograd.grad(pulled(found), [looked, *network.parameters()])
+        gradients = torch.autograd.grad(pulled(found), [features, *network.parameters()])
         results.append((found, gradients))
     (wanted, slopes), (found, gradients) = results
     for name, value in vars(wanted).items():
@@ -130,7 +135,7 @@ def test_colours_left_out_in_evaluation_do_not_show(how: Compositing, chunk: int
     full = composite_head(network, given, how, keep_feature=True)
     with torch.no_grad():
         seen = composite_head(network, given, how, keep_feature=True)
-    dim = (full.weights > 0) & (full.weights < module.UNSEEN)
+    dim = (full.weights > 0) & (full.weights < module.MIN_WEIGHT_EVAL)
     assert dim.any(), "there must be something to leave out"
     torch.testing.assert_close(seen.rgb, full.rgb, rtol=0, atol=1e-3)
     for name in ("depth", "opacity", "weights", "feature"):
@@ -139,16 +144,18 @@ def test_colours_left_out_in_evaluation_do_not_show(how: Compositing, chunk: int
 
 def test_training_asks_for_the_colour_of_lit_points_only(monkeypatch):
     """A density that is not positive has no colour to show and nothing to learn."""
-    monkeypatch.setattr(module, "ROUND", 8)
+    monkeypatch.setattr(module, "MULTIPLE", 8)
     network, given = head(), work(noisy=True)
-    asked: list[int] = []
+    selected: list[int] = []
     colour = network.colour
     monkeypatch.setattr(
-        network, "colour", lambda feature, seen: asked.append(len(feature)) or colour(feature, seen)
+        network,
+        "colour",
+        lambda feature, seen: selected.append(len(feature)) or colour(feature, seen),
     )
     found = composite_head(network, given, HOWS["frustum"])
-    lit = int((found.weights > module.SPECK).sum())
-    assert lit <= sum(asked) < lit + 8 < 0.9 * RAYS * SAMPLES
+    lit = int((found.weights > module.MIN_WEIGHT_TRAIN).sum())
+    assert lit <= sum(selected) < lit + 8 < 0.9 * RAYS * SAMPLES
 
 
 @pytest.mark.parametrize("seeing", [torch.no_grad, torch.enable_grad])

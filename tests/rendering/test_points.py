@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sharpfield.core.rays import Rays
 from sharpfield.ops.knn import first_near, neighbours, sort_into_cells
-from sharpfield.rendering.points import Asked, PointMarch
+from sharpfield.rendering.points import PointMarch, ShadedSamples
 
 DENSITY = 3.0
 
@@ -45,7 +45,7 @@ def rays(slope: tuple[float, ...] = (0.0, 0.2, 3.0)) -> Rays:
     return Rays(torch.zeros(count, 3), direction, torch.zeros(count), torch.ones(count))
 
 
-def red(asked: Asked) -> Tensor:
+def red(asked: ShadedSamples) -> Tensor:
     return torch.tensor([1.0, 0.0, 0.0]).expand(len(asked), 3)
 
 

@@ -1,4 +1,4 @@
-"""Which device tensors and models are on."""
+"""The device of tensors and models."""
 
 from itertools import chain
 
@@ -7,7 +7,7 @@ from torch import nn
 
 
 def device_of(part: object) -> torch.device:
-    """Where a module's tensors are; the CPU if it is no module, or holds none."""
+    """The device of a module's tensors; the CPU if it is no module, or has none."""
     if not isinstance(part, nn.Module):
         return torch.device("cpu")
     held = next(chain(part.parameters(), part.buffers()), None)

@@ -1,4 +1,4 @@
-"""What event cameras report: where and when brightness changed by a threshold, and its sign.
+"""Event streams: pixel, time and polarity of each change of log brightness by a threshold.
 
 Several cameras of one kind, on one clock, share a stream; `track` tells them apart. Integer
 coordinates name a pixel of the sensor (its centre is at +0.5). Float coordinates are rectified
@@ -94,7 +94,7 @@ class SiteColour:
 
 
 def checked(events: EventStream, where: object) -> EventStream:
-    """The same stream, once it is known to be sound.
+    """The same stream, after checking that it is valid.
 
     Args:
         events: A whole stream, in memory (a reader of larger ones calls this for each chunk).

@@ -1,4 +1,4 @@
-"""Writing without half-written results: everything goes to a temporary name first, then moves."""
+"""Atomic writing: to a temporary name first, which then replaces the target."""
 
 import contextlib
 import json
@@ -12,7 +12,7 @@ from typing import Any
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Generator[Path, None, None]:
-    """A temporary file beside `path` that takes its place when the block ends well.
+    """A temporary file beside `path` that replaces it when the block ends without an error.
 
     The temporary name keeps the suffix, which many writers use to choose the format. When the
     block raises, the temporary file is removed and whatever was at `path` stays as it was.
@@ -38,7 +38,7 @@ def write_json(path: Path, about: Any) -> None:
 
 @contextlib.contextmanager
 def replacing_folder(path: Path) -> Generator[Path, None, None]:
-    """A temporary folder beside `path` that takes its place when the block ends well.
+    """A temporary folder beside `path` that replaces it when the block ends without an error.
 
     An earlier folder at `path` is moved aside first and deleted only once the new one is there.
     """

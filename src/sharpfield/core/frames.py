@@ -1,11 +1,7 @@
-"""Images on the capture's clock.
-
-When the shutter was open.
-
-What a depth camera measured beside the frames: one map for each frame, on the same clock.
+"""Frames on the capture's clock, their exposures, and the depth maps measured with them.
 
 Depth is along the camera's axis, at pixel centres. The depth camera may have fewer pixels than the
-frames and a lens of its own, but stands where the frame camera stands (data sets call that
+frames and a lens of its own, but the same pose as the frame camera (data sets call that
 *registered*). Maps stay as sensors store them, 16 bit, so that they can be mapped from disk.
 """
 
@@ -23,7 +19,7 @@ from sharpfield.core.errors import CaptureError
 class Exposure:
     """Opening and closing time of the shutter for each frame, in us on the capture's clock.
 
-    A frame with `open_us == close_us` is an instant: a sharp image, as far as motion goes.
+    A frame with `open_us == close_us` is an instant: an image without motion blur.
     """
 
     open_us: Int64[np.ndarray, "n"]
@@ -87,7 +83,7 @@ class Exposure:
 
 
 ENCODINGS = ("linear", "gamma2.2", "srgb")
-"""How stored values relate to light: not at all bent, by a power of 1/2.2, by the sRGB curve."""
+"""Tone curves of stored values: linear, a power of 1/2.2, the sRGB curve."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +93,7 @@ class Frames:
     `images` hold what was stored, display-referred unless `encoding` is "linear"; 8 or 16 bit, with
     1 or 3 channels (RGB). `truth`, where known, is the sharp image at the middle of each
     exposure, in the same encoding; `truth_known` says for which frames, all if it is None. `depth`
-    and `flow`, where known, say what the scene was like at that instant.
+    and `flow`, where known, are those of the scene at that instant.
     """
 
     images: UInt8[np.ndarray, "n h w c"] | UInt16[np.ndarray, "n h w c"]
@@ -187,7 +183,7 @@ class Frames:
 
 
 MILLIMETRE = 0.001
-"""What one step of a stored depth means to most sensors, in metres."""
+"""One step of stored depth of most sensors, in metres."""
 
 
 @dataclass(frozen=True)
@@ -220,7 +216,7 @@ class DepthMaps:
         return len(self.stored)
 
     def at(self, frame: int) -> Float32[np.ndarray, "h w"]:
-        """Depth in world units seen by one frame; 0 where unknown."""
+        """Depth of one frame in world units; 0 where unknown."""
         return np.asarray(self.stored[frame]).astype(np.float32) * np.float32(self.unit)
 
     def rays(self) -> Float32[np.ndarray, "h w 3"]:

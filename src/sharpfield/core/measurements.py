@@ -1,4 +1,4 @@
-"""What one training step looks at: pixels, pairs of events, and instants, as tensors."""
+"""Training batches as tensors: pixels, pairs of events, views and their measured depths."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -39,20 +39,20 @@ class EventPairs(Struct):
     trailing: ClassVar = {"xy": 1}
 
     xy: Float[Tensor, "*b 2"]
-    """Where the pixel looks, in pixels (centres at +0.5)."""
+    """Position of the pixel, in pixels (centres at +0.5)."""
     track: Int64[Tensor, "*b"]
     start: Float[Tensor, "*b"]
     """First instant, 0...1 of the capture."""
     end: Float[Tensor, "*b"]
     negative: Float[Tensor, "*b"]
-    """Minus the number of events to darker: 0, -1, ...; parts of one where the phase is known."""
+    """Minus the number of OFF events: 0, -1, ...; fractional where the phase is known."""
     positive: Float[Tensor, "*b"]
-    """Number of events to brighter."""
+    """Number of ON events."""
     channel: Int64[Tensor, "*b"] | None = None
     """Colour filter of the pixel: 0 red, 1 green, 2 blue. None on a mono sensor."""
     slack: Float[Tensor, "*b"] | None = None
-    """By how many events the counts may be off because they are whole. None for pairs that begin
-    and end with an event, where they are exact."""
+    """Possible error of the counts, in events, since they are whole numbers. None for pairs that
+    begin and end with an event, where they are exact."""
 
     def measured(
         self, threshold_negative: Tensor | float, threshold_positive: Tensor | float

@@ -1,4 +1,4 @@
-"""What a recipe implements, and where it differs from what its authors published."""
+"""The publication that a recipe implements, and where the recipe departs from it."""
 
 from dataclasses import dataclass
 
@@ -12,4 +12,4 @@ class Paper:
     title: str
     bibtex: str
     departures: tuple[str, ...] = ()
-    """Each place where we knowingly differ from the published code, in words, with the reason."""
+    """Each known departure from the published code, in words, with the reason."""

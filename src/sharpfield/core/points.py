@@ -1,8 +1,8 @@
-"""How a set of points changes its number: which rows stay, which are copied, what starts anew.
+"""Growth of a set of points: which rows are kept, copied or new.
 
-A *point* is whatever a scene is made of and has one row in each of several tensors: a Gaussian, a
-neural point. A *growth* says what the next set is made of in terms of the present one, so that
-pruning, cloning, splitting and moving points are all the same operation.
+A *point* is an element of a scene with one row in each of several tensors: a Gaussian, a neural
+point. A *growth* describes the next set in terms of the present one, so that pruning, cloning,
+splitting and relocating points are all the same operation.
 """
 
 from dataclasses import dataclass, field
@@ -19,9 +19,9 @@ class Growth:
     source: Int64[Tensor, "m"]
     """The row that each point is a copy of."""
     fresh: Bool[Tensor, "m"]
-    """Points the optimizer has never seen, whatever they are copied from."""
+    """Points whose optimizer state is reset."""
     values: dict[str, Float[Tensor, "m ..."]] = field(default_factory=dict[str, Tensor])
-    """Tensors by name that are not just copied; rows that equal their source's are left alone."""
+    """Tensors by name that are not just copied; rows equal to their source's stay as they are."""
 
     def __len__(self) -> int:
         """Number of points afterwards."""
@@ -29,6 +29,6 @@ class Growth:
 
 
 def unchanged(count: int, device: torch.device | str = "cpu") -> Growth:
-    """The growth that leaves everything as it is; give it `values` to set some of them."""
+    """The growth that changes nothing; give it `values` to set some of them."""
     every = torch.arange(count, device=device)
     return Growth(every, torch.zeros_like(every, dtype=torch.bool))

@@ -5,6 +5,6 @@ from rich.progress import Progress, ProgressColumn
 
 
 def progress_on(console: Console, *columns: ProgressColumn) -> Progress:
-    """Bars that vanish when done, and are not there where nobody watches."""
+    """Progress bars that vanish when done; disabled where the output is no terminal."""
     quiet = not console.is_terminal
     return Progress(*columns, console=console, transient=True, disable=quiet)

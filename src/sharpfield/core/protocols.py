@@ -1,8 +1,8 @@
-"""What the parts of the house may ask of each other.
+"""The interfaces between the parts of the package.
 
-Read this first: a `Trajectory` says where a camera is, a `Field` what a scene emits, a
-`Renderer` gathers that along rays, a `Formation` turns sharp light into what a sensor reports,
-and a `Recipe` builds a `Model` from these on one capture.
+Read this first: a `Trajectory` is the pose of a camera over time, a `Field` the density and colour
+of a scene, a `Renderer` integrates a field along rays, a `Formation` turns sharp light into what a
+sensor reports, and a `Recipe` builds a `Model` from these for one capture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ class Trajectory(Protocol):
     """Where the camera of each track is, at any time of the capture.
 
     A track is one camera's path. A hand-held camera has one; photos without a known path are
-    one still track each; a rig of event cameras has many.
+    one static track each; a rig of event cameras has many.
     """
 
     def pose(
@@ -43,26 +43,26 @@ class Trajectory(Protocol):
         ...
 
     def known_us(self, track: int) -> tuple[int, int] | None:
-        """First and last time with a known pose; None for a track that stands still."""
+        """First and last time with a known pose; None for a static track."""
         ...
 
 
 @runtime_checkable
 class Head(Protocol):
-    """A small network that turns what was looked up at points into density and colour.
+    """A small network that turns the features at points into density and colour.
 
-    Its parts are asked one after the other, so that a renderer can leave out the later ones, which
-    cost most, for points that nobody sees.
+    Its parts are called one after the other, so that a renderer can skip the later ones, which cost
+    most, for points that contribute no light.
     """
 
     def density(
-        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+        self, features: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
-        """Density before its activation, and what the features are made from."""
+        """Density before its activation, and the hidden layer."""
         ...
 
     def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s f"]:
-        """What colour is made from, and what other networks may read of a point."""
+        """Features from which colour is computed, and which other networks may read."""
         ...
 
     def colour(
@@ -74,11 +74,11 @@ class Head(Protocol):
 
 @runtime_checkable
 class Field(Protocol):
-    """A sharp scene, asked in two stages: a coarse look, then a fine one where it matters.
+    """A sharp scene, evaluated in two stages: coarse samples, then fine ones by importance.
 
-    Looking up features is apart from the heads because it is memory-bound and its result small,
-    while the heads are compute-bound and their activations large: a renderer may recompute heads
-    in the backward pass, chunk by chunk, and keep only what was looked up.
+    Feature lookup is separate from the heads because it is memory-bound and its result small, while
+    the heads are compute-bound and their activations large: a renderer may recompute heads in the
+    backward pass, chunk by chunk, and keep only the features.
     """
 
     @property
@@ -91,15 +91,15 @@ class Field(Protocol):
         """Of the second stage."""
         ...
 
-    def look(
+    def coarse_features(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s f"]:
         """Features for the coarse head; `time` belongs to the whole ray."""
         ...
 
-    def look_closer(
+    def fine_features(
         self,
-        looked: Float[Tensor, "*b s f"],
+        features: Float[Tensor, "*b s f"],
         old: Float[Tensor, "*b s 3"],
         new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],
@@ -110,7 +110,7 @@ class Field(Protocol):
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Light gathered along rays."""
+    """Integrates a field along rays."""
 
     def __call__(self, rays: Rays, generator: Generator | None = None) -> Radiance:
         """Radiance of rays; with a generator, samples are jittered and noisy, for training."""
@@ -132,18 +132,18 @@ class Formation(Protocol[M]):
 
 @runtime_checkable
 class Model(Protocol):
-    """A recipe built on one capture: all that training, evaluation and viewer may ask of it.
+    """A recipe built for one capture: the interface that training and evaluation use.
 
     Every model is also an `nn.Module`.
     """
 
     capture: "Capture"
-    """The capture as the model sees it: in the model's own space."""
+    """The capture in the model's own space."""
     heaviest_step: int
     """The step of the schedule that needs most memory and time."""
 
     def draw(self, step: int) -> Batch:
-        """What step `step` looks at; depends on the step and the seed alone."""
+        """The batch of a step; depends on the step and the seed only."""
         ...
 
     def losses(self, batch: Batch, step: int) -> dict[str, Float[Tensor, ""]]:
@@ -175,19 +175,19 @@ class PointSet(Protocol):
         ...
 
     def replace(self, points: Mapping[str, Tensor]) -> None:
-        """Take others in their place, with another number of rows; parameters stay parameters."""
+        """Replace them by others, with another number of rows; parameters stay parameters."""
         ...
 
 
 @runtime_checkable
 class Growing(Protocol):
-    """A model whose points become more, fewer, or others while it learns."""
+    """A model that adds, removes or replaces points during training."""
 
     def grow(self, step: int) -> Sequence[tuple[PointSet, Growth]]:
-        """What becomes of point sets after step `step`; depends on the model, step and seed alone.
+        """Changes of point sets after a step; depends on the model, step and seed only.
 
-        The gradients of the step are still there. What else a model does to itself after a step,
-        such as noise on its points, it does here.
+        The gradients of the step are still available. Other updates after a step, such as position
+        noise, are made here, too.
         """
         ...
 
@@ -204,11 +204,11 @@ class Recipe(Protocol):
 
     @property
     def steps(self) -> int:
-        """Length of its schedule."""
+        """Number of training steps."""
         ...
 
     def lasting(self, steps: int) -> "Recipe":
-        """The same recipe with its whole schedule stretched or shrunk."""
+        """The same recipe with its whole schedule rescaled to a number of steps."""
         ...
 
     def build(self, capture: "Capture", seed: int) -> Model:

@@ -1,9 +1,4 @@
-"""Rays through the scene.
-
-Light gathered along rays, and the points it was gathered from.
-
-Whole images asked for at once: grids of rays that share a pose and a time.
-"""
+"""Rays through the scene, the radiance along them, and views: images of one pose and time."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,7 +11,7 @@ from sharpfield.core.struct import Struct
 
 @dataclass(frozen=True)
 class Samples(Struct):
-    """Points along rays, near to far, with what a field found there."""
+    """Points along rays, near to far, with the features of a field at them."""
 
     trailing: ClassVar = {"depth": 1, "feature": 2, "direction": 1}
 
@@ -25,7 +20,7 @@ class Samples(Struct):
     feature: Float[Tensor, "*b s f"]
     """Hidden features of the fine head."""
     direction: Float[Tensor, "*b 3"]
-    """Of the ray, in the renderer's space; its length matters."""
+    """Of the ray, in the renderer's space; not normalised: its length scales the depths."""
 
 
 @dataclass(frozen=True)

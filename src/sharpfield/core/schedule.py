@@ -32,7 +32,7 @@ def cosine(start: float, end: float, *, begin: int, until: int) -> Schedule:
 
 
 def exponential(start: float, end: float, *, until: int, begin: int = 0) -> Schedule:
-    """Falls (or grows) by a constant factor per step, from `start` to `end`, then goes on so.
+    """Changes by a constant factor per step, from `start` to `end`, and on beyond `until`.
 
     It is not clamped at `until`: published learning rates are given as "a tenth every so many
     steps" and keep falling.

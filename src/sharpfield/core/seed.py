@@ -1,9 +1,7 @@
-"""The only source of randomness: a generator for each (seed, step, stream).
+"""Random generators keyed by (seed, step, stream): the only source of randomness.
 
-Nothing in the project counts steps or touches the global generator, so what is drawn at step 700
-does not depend on how step 700 was reached, and resuming equals never having stopped.
-
-Some of many.
+Nothing in the project counts steps or uses the global generator, so what is drawn at step 700 does
+not depend on how step 700 was reached, and a resumed run equals an uninterrupted one.
 """
 
 import hashlib

@@ -1,4 +1,4 @@
-"""The field of NeRF: two large networks of position and direction, and nothing looked up.
+"""The field of NeRF: two large MLPs of position and direction, without a feature lookup.
 
 Source: NeRF (ECCV 2020), appendix A.
 """
@@ -12,11 +12,11 @@ from sharpfield.ops.encoding import frequencies, frequencies_width
 
 
 class MLPHead(nn.Module):
-    """Eight wide layers with a skip, then a short branch that sees the direction.
+    """Eight wide layers with a skip, then a short branch with the direction as input.
 
     Args:
         width: Of the layers; 256 in the paper.
-        depth: Number of layers; the input is seen again after half of them.
+        depth: Number of layers; the input is concatenated again after half of them.
         generator: Where the first parameters come from.
         position: Octaves of the position's encoding.
         direction: Octaves of the direction's encoding.
@@ -45,7 +45,7 @@ class MLPHead(nn.Module):
         self.last = linear(width // 2, colours, generator=generator)
 
     def density(
-        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+        self, features: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
         """Density before its activation, and the features of the trunk."""
         hidden = torch.relu(self.trunk(frequencies(points, self.position)))
@@ -91,15 +91,15 @@ class MLPField(nn.Module):
         ]
         self.coarse, self.fine = heads[0], heads[-1]
 
-    def look(
+    def coarse_features(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s 0"]:
-        """Nothing: the networks see the position itself."""
+        """Nothing: the networks read the position itself."""
         return points[..., :0]
 
-    def look_closer(
+    def fine_features(
         self,
-        looked: Float[Tensor, "*b s 0"],
+        features: Float[Tensor, "*b s 0"],
         old: Float[Tensor, "*b s 3"],
         new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],

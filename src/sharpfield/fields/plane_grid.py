@@ -82,10 +82,10 @@ class Volume(nn.Module):
 
 
 class PlaneHead(nn.Module):
-    """Density and colour from looked-up features and the encoded position.
+    """Density and colour from the features of a volume and the encoded position.
 
     Args:
-        looked: Width of the looked-up features.
+        features: Width of the looked-up features.
         size: Widths of the layers.
         generator: Where the first parameters come from.
         octaves: Frequencies in the encoding of position and of direction.
@@ -94,7 +94,7 @@ class PlaneHead(nn.Module):
 
     def __init__(
         self,
-        looked: int,
+        features: int,
         size: HeadSize,
         *,
         generator: torch.Generator,
@@ -104,7 +104,7 @@ class PlaneHead(nn.Module):
         super().__init__()
         self.position, self.direction = octaves
         self.precision = precision
-        width = looked + frequencies_width(3, self.position)
+        width = features + frequencies_width(3, self.position)
         self.inside = linear(width, size.hidden, generator=generator, bias=False)
         self.out = linear(size.hidden, size.feature + 1, generator=generator, bias=False)
         self.first = SplitLinear(
@@ -117,15 +117,15 @@ class PlaneHead(nn.Module):
         self.last = Dense([size.colour, size.colour, 3], generator=generator, bias=False)
 
     def density(
-        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+        self, features: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
         """Density before its activation, and the hidden layer."""
-        encoded = torch.cat([looked, frequencies(points, self.position)], -1)
+        encoded = torch.cat([features, frequencies(points, self.position)], -1)
         hidden = torch.relu(apply_linear(self.inside.weight, None, encoded.to(self.precision)))
         return apply_linear(self.out.weight[:1], None, hidden)[..., 0].float(), hidden
 
     def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s f"]:
-        """What the layer that gives density gives besides."""
+        """The other outputs of the layer that gives density."""
         return apply_linear(self.out.weight[1:], None, hidden)
 
     def colour(
@@ -144,7 +144,7 @@ class PlaneField(nn.Module):
         voxels: Voxels of the coarse and of the fine volume.
         generator: Where the first parameters come from.
         heads: Widths of the coarse and of the fine head.
-        features: Width of what one look-up gives.
+        features: Width of the features of each volume.
         channels: Features of the planes of both volumes.
         octaves: Frequencies in the encoding of position and of direction.
         precision: What the heads compute in.
@@ -174,21 +174,21 @@ class PlaneField(nn.Module):
             for width, size in zip((features, 2 * features), heads, strict=True)
         )
 
-    def look(
+    def coarse_features(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s f"]:
-        """Features of the coarse volume; the scene stands still, so time does not matter."""
+        """Features of the coarse volume; the scene is static, so time does not matter."""
         return self.volumes[0](points)
 
-    def look_closer(
+    def fine_features(
         self,
-        looked: Float[Tensor, "*b s f"],
+        features: Float[Tensor, "*b s f"],
         old: Float[Tensor, "*b s 3"],
         new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],
     ) -> Float[Tensor, "*b t g"]:
-        """Features of both volumes; the coarse one's at old points are taken from `looked`."""
-        wide = torch.cat([looked, self.volumes[0](new)], -2)
+        """Features of both volumes; the coarse one's at old points are taken from `features`."""
+        wide = torch.cat([features, self.volumes[0](new)], -2)
         close = self.volumes[1](torch.cat([old, new], -2))
         return torch.cat([wide, close], -1)
 

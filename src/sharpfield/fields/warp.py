@@ -1,7 +1,7 @@
-"""A field that moves: points are carried back to where they were at the first instant.
+"""A deformable field: points at a time are mapped to a static canonical field.
 
-A *deformation* says how far a point at a time is from its place in the *canonical* scene, which
-stands still. `Warped` looks there instead, so that any still field becomes one of a moving scene.
+A *deformation* gives the offset of a point at a time to its position in the *canonical* scene.
+`Warped` evaluates a static field there, so that any field can represent a moving scene.
 
 Source: D-NeRF (CVPR 2021), section 3, whose networks EvDNeRF (WACV 2024) keeps.
 """
@@ -21,22 +21,22 @@ AtZero = Literal["exactly", "smoothly"]
 after it (published); or it is multiplied by time."""
 
 HALF = 5
-"""Layers of the published network before the position is seen again."""
+"""Layers of the published network before the position is concatenated again."""
 
 
 @runtime_checkable
 class Motion(Protocol):
-    """Where points have moved from."""
+    """A deformation of points over time."""
 
     def __call__(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s 3"]:
-        """What to add to points of each ray to be in the canonical scene."""
+        """Offsets from points of each ray to the canonical scene."""
         ...
 
 
 class Deformation(nn.Module):
-    """The network of D-NeRF: eight wide layers of position and time, position seen again.
+    """The network of D-NeRF: eight wide layers of position and time, with a skip of the position.
 
     Args:
         generator: Where the first parameters come from.
@@ -58,38 +58,38 @@ class Deformation(nn.Module):
         at_zero: AtZero = "exactly",
     ) -> None:
         super().__init__()
-        assert depth > HALF, f"the position is seen again after {HALF} layers, not {depth}"
+        assert depth > HALF, f"the skip is after {HALF} layers, there are {depth}"
         self.position, self.moment, self.at_zero = position, moment, at_zero
-        seen = frequencies_width(3, position)
-        first = [seen + frequencies_width(1, moment), *([width] * HALF)]
+        inputs = frequencies_width(3, position)
+        first = [inputs + frequencies_width(1, moment), *([width] * HALF)]
         self.before = Dense(first, generator=generator)
-        self.after = Dense([seen + width, *([width] * (depth - HALF)), 3], generator=generator)
+        self.after = Dense([inputs + width, *([width] * (depth - HALF)), 3], generator=generator)
 
     def forward(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s 3"]:
-        """What to add to points."""
-        place = frequencies(points, self.position)
-        when = frequencies(time[..., None], self.moment)[..., None, :]
-        when = when.expand(*place.shape[:-1], when.shape[-1])
-        hidden = torch.relu(self.before(torch.cat([place, when], -1)))
-        moved = self.after(torch.cat([place, hidden], -1))
-        share = time if self.at_zero == "smoothly" else (time != 0).to(time.dtype)
-        return moved * share[..., None, None]
+        """Offsets of points."""
+        position = frequencies(points, self.position)
+        moment = frequencies(time[..., None], self.moment)[..., None, :]
+        moment = moment.expand(*position.shape[:-1], moment.shape[-1])
+        hidden = torch.relu(self.before(torch.cat([position, moment], -1)))
+        offset = self.after(torch.cat([position, hidden], -1))
+        factor = time if self.at_zero == "smoothly" else (time != 0).to(time.dtype)
+        return offset * factor[..., None, None]
 
 
 class _WarpedHead(nn.Module):
-    """A head at canonical points, which come with what was looked up there."""
+    """A head at canonical points, which are the first three of the features."""
 
     def __init__(self, head: Head) -> None:
         super().__init__()
         self.head = head
 
     def density(
-        self, looked: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
+        self, features: Float[Tensor, "*b s f"], points: Float[Tensor, "*b s 3"]
     ) -> tuple[Float[Tensor, "*b s"], Float[Tensor, "*b s h"]]:
         """Of the canonical scene; the points themselves do not matter."""
-        return self.head.density(looked[..., 3:], looked[..., :3])
+        return self.head.density(features[..., 3:], features[..., :3])
 
     def feature(self, hidden: Float[Tensor, "*b s h"]) -> Float[Tensor, "*b s g"]:
         """Of the canonical scene."""
@@ -98,16 +98,16 @@ class _WarpedHead(nn.Module):
     def colour(
         self, feature: Float[Tensor, "*b s g"], direction: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b s c"]:
-        """Of the canonical scene; the direction is not turned."""
+        """Of the canonical scene; the direction is not rotated."""
         return self.head.colour(feature, direction)
 
 
 class Warped(nn.Module):
-    """A still field, made to move.
+    """A static field with a deformation.
 
     Args:
         field: The canonical scene.
-        deformation: From a moment to it.
+        deformation: From a time to it.
     """
 
     def __init__(self, field: Field, deformation: Motion) -> None:
@@ -116,22 +116,22 @@ class Warped(nn.Module):
         self.coarse = _WarpedHead(field.coarse)
         self.fine = _WarpedHead(field.fine)
 
-    def look(
+    def coarse_features(
         self, points: Float[Tensor, "*b s 3"], time: Float[Tensor, "*b"]
     ) -> Float[Tensor, "*b s f"]:
-        """Canonical points, and what the field finds there."""
+        """Canonical points, and the field's features there."""
         moved = points + self.deformation(points, time)
-        return torch.cat([moved, self.field.look(moved, time)], -1)
+        return torch.cat([moved, self.field.coarse_features(moved, time)], -1)
 
-    def look_closer(
+    def fine_features(
         self,
-        looked: Float[Tensor, "*b s f"],
+        features: Float[Tensor, "*b s f"],
         old: Float[Tensor, "*b s 3"],
         new: Float[Tensor, "*b m 3"],
         time: Float[Tensor, "*b"],
     ) -> Float[Tensor, "*b t g"]:
-        """The same closely; old points were carried back before."""
-        back = looked[..., :3]
+        """The same for the fine stage; the old points are already canonical."""
+        back = features[..., :3]
         moved = new + self.deformation(new, time)
-        found = self.field.look_closer(looked[..., 3:], back, moved, time)
+        found = self.field.fine_features(features[..., 3:], back, moved, time)
         return torch.cat([torch.cat([back, moved], -2), found], -1)

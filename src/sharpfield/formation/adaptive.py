@@ -1,16 +1,16 @@
-"""Weights of a pixel's rays, proposed from what lies along them.
+"""Adaptive weight proposal: weights of a pixel's rays, from the features along them.
 
-The rigid kernel gives all pixels of an image the same weights. This network looks at the features
-of the scene along each ray of a pixel and proposes weights for that pixel alone, with which the
-same light is mixed a second time.
+The rigid kernel gives all pixels of an image the same weights. This network reads the features of
+the scene along each ray of a pixel and proposes weights for that pixel only, with which the same
+light is mixed a second time.
 
 Vocabulary: k rays of a pixel, s samples on each, f features of a sample. A *local* feature belongs
 to a sample, the *global* one to a ray. *Inter* summarises each ray over its samples, *intra* each
 sample over the rays.
 
-Memory: the features `[b, k, s, f]` are the largest thing in a training step. They are read where
-they lie, a few pixels at a time, and whatever else has their length is computed again in the
-backward pass instead of being kept.
+Memory: the features `[b, k, s, f]` are the largest tensor of a training step. They are read in
+place, a few pixels at a time, and other tensors of their length are recomputed in the backward pass
+instead of being kept.
 
 Sources: DP-NeRF (CVPR 2023), section 3.3 (adaptive weight proposal), with the curve aggregation of
 CurveNet (ICCV 2021); sizes from Ev-DeblurNeRF (CVPR 2024).
@@ -95,10 +95,10 @@ class AdaptiveWeights(nn.Module):
     def _summaries(
         self, samples: Samples
     ) -> tuple[Float[Tensor, "b k e"], Float[Tensor, "b k l"], Float[Tensor, "b s l"]]:
-        """All that looks at single samples: each ray gathered, and the two summaries."""
+        """All that reads single samples: each ray integrated, and the two summaries."""
         length = samples.direction.square().sum(-1, keepdim=True).sqrt()
         gap = samples.depth.diff(dim=-1) * length
-        gap = nn.functional.pad(gap, (0, 1))  # the last sample counts nothing
+        gap = nn.functional.pad(gap, (0, 1))  # the last sample has no weight
         at_once = CPU_CHUNK if gap.is_cpu else CHUNK
         pixels = max(at_once // gap.shape[1:].numel(), 1)
         pieces = zip(torch.split(samples.feature, pixels), torch.split(gap, pixels), strict=True)

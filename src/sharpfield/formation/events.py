@@ -1,8 +1,8 @@
 """The event sensor: the change of log intensity between two instants of a pixel.
 
-An event says that the log of the light at its pixel has changed by the contrast threshold since
-the pixel's previous event. So a pair of instants and the events between them measure a
-difference of two logarithms, which is the one formula with weights -1 and +1.
+At an event, the log of the light at its pixel has changed by the contrast threshold since the
+pixel's previous event. So two instants and the events between them measure a difference of two
+logarithms, which is the image formation formula with weights -1 and +1.
 
 Source: Ev-DeblurNeRF (CVPR 2024), event-by-event supervision; EventNeRF (CVPR 2023) for colour.
 """
@@ -28,7 +28,7 @@ class LogContrast:
     camera: Camera
     trajectory: Trajectory
     response: Response
-    """Light to the logarithm of what the photoreceptor reports."""
+    """Light to the logarithm of the photoreceptor's output."""
 
     def expose(self, seen: EventPairs) -> Rays:
         """Rays `[b, 2]`: at the start with weight -1, at the end with weight +1."""
@@ -45,10 +45,10 @@ class LogContrast:
 
 @dataclass(frozen=True)
 class ChainedContrast:
-    """The same for runs of pairs that follow each other: `m + 1` rays instead of `2 m`.
+    """The same for runs of consecutive pairs: `m + 1` rays instead of `2 m`.
 
     Measurements are `[b, m]` pairs of one pixel each, every pair beginning where the one before it
-    ended. One instant is rendered once, though it serves two pairs.
+    ends, so that each instant is rendered once for two pairs.
     """
 
     contrast: LogContrast

@@ -1,10 +1,10 @@
-"""The one formula: a measurement is a weighted sum of the sharp light along a few rays.
+"""The image formation formula: a measurement is a weighted sum of the sharp light along a few rays.
 
     observed = outer( sum_k  w_k inner( L_k ) )
 
-`L_k` is the linear light along ray k and `w_k` the weight that rides with that ray. A sensor is
-then a way to choose rays and weights (*expose*) and two curves: `inner` acts on the light of each
-ray, `outer` on their sum.
+`L_k` is the linear light along ray k and `w_k` the weight stored with that ray. A sensor is then a
+choice of rays and weights (*expose*) and two curves: `inner` is applied to the light of each ray,
+`outer` to their sum.
 """
 
 import torch
@@ -18,7 +18,7 @@ from sharpfield.core.tone import Curve, identity
 def mix(
     radiance: Radiance, inner: Curve = identity, outer: Curve = identity
 ) -> Float[Tensor, "*b c"]:
-    """What a sensor reports of the light along its rays.
+    """The measurement of a sensor, from the light along its rays.
 
     Args:
         radiance: Light of the rays `[*b, k]` that make each measurement, with their weights.
@@ -30,14 +30,15 @@ def mix(
 
 
 def mix_with_few_gradients(few: Radiance, rest: Radiance) -> Float[Tensor, "*b c"]:
-    """The mean light of many rays, with the gradient of the mean of a few of them.
+    """The mean light of many rays, with the gradient of the mean of a few of them only.
 
     Args:
-        few: Those that learn `[*b, k]`, with weights that add up to 1.
-        rest: The others `[*b, r]`, drawn without a gradient, with their weights in the whole mean.
+        few: Rays with gradients `[*b, k]`, whose weights add up to 1.
+        rest: The others `[*b, r]`, rendered without gradients, with their weights in the whole
+            mean.
     """
     mean = mix(few)
     with torch.no_grad():
-        share = 1 - rest.weight.sum(-1)[..., None]
-        missing = mix(rest) + share * mean - mean
+        weight = 1 - rest.weight.sum(-1)[..., None]
+        missing = mix(rest) + weight * mean - mean
     return mean + missing

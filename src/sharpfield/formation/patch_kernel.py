@@ -1,8 +1,8 @@
-"""Blur of small patches: simple kernels of which the best is chosen, or one learned for each patch.
+"""Blur kernels of small patches: the best of a fixed set, or one predicted for each patch.
 
 A rendered patch is sharp, a recorded one may be blurred. Before they are compared, the rendered one
-is blurred by the kernel that makes it most like the recorded one. There is a kernel that does
-nothing, so sharp patches stay sharp. Kernels know nothing of cameras or depth.
+is blurred by the kernel that makes it most similar to the recorded one. One kernel is the identity,
+so that sharp patches stay sharp. Kernels do not depend on cameras or depth.
 
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.2; sizes and rules from the released code.
 """
@@ -19,29 +19,29 @@ from sharpfield.ops.dense import LeakyLayers
 from sharpfield.ops.patch import best_match, convolve, convolve_all
 
 PARTS, FINE = 32, 1024
-"""Places between pixels are rounded to parts of one, from sums of finer ones, as OpenCV used to do
-in rotating images."""
+"""Subpixel positions are rounded to 1/PARTS, from sums rounded to 1/FINE, as OpenCV used to do when
+rotating images."""
 
 FAINT = 1e-6
-"""Least share of a kernel on known pixels that a pixel is divided by."""
+"""Smallest sum of a kernel over known pixels that a pixel is divided by."""
 
 Kind = Literal["outward", "through", "both"]
-"""Strokes that begin at the pixel (8 directions), go through it (4), or both."""
+"""Line kernels that begin at the pixel (8 directions), are centred on it (4), or both."""
 
 Edge = Literal["keep", "divide", "still"]
-"""What replaces the part of a learned kernel that lies outside the patch: the pixel itself; a
-larger weight of the rest; or the latter without a gradient through it."""
+"""What replaces the part of a learned kernel outside the patch: the pixel itself; a larger weight
+of the rest; or the latter without a gradient through that weight."""
 
 
 def motion_kernels(
     size: int = 9, distances: tuple[int, ...] = (1, 2, 4), *, kind: Kind = "both"
 ) -> Float[Tensor, "q k k"]:
-    """Straight strokes in all directions, each summing to one.
+    """Straight line kernels in all directions, each summing to one.
 
     Args:
         size: Pixels a side; odd.
-        distances: How far strokes reach from the pixel.
-        kind: Where they begin.
+        distances: Length from the pixel, in pixels.
+        kind: See `Kind`.
     """
     kernels: list[Tensor] = []
     if kind in ("outward", "both"):
@@ -52,10 +52,10 @@ def motion_kernels(
 
 
 class ChosenKernel(nn.Module):
-    """The best of some kernels for each patch, or none of them.
+    """The best of some kernels for each patch, or the identity.
 
     Args:
-        kernels: To choose from, besides doing nothing.
+        kernels: To choose from, besides the identity.
     """
 
     kernels: Tensor
@@ -72,12 +72,12 @@ class ChosenKernel(nn.Module):
         recorded: Float[Tensor, "m h w c"],
         known: Float[Tensor, "m h w"],
     ) -> Float[Tensor, "m h w c"]:
-        """Patches blurred to look like recorded ones; gradients flow through the chosen kernels.
+        """Patches blurred to match recorded ones; gradients flow through the chosen kernels.
 
         Args:
             sharp: As rendered.
-            recorded: As they should be.
-            known: 1 where something was rendered; other pixels count for nothing.
+            recorded: The target.
+            known: 1 where something was rendered; other pixels do not count.
         """
         mask = known[..., None]
         with torch.no_grad():
@@ -90,14 +90,14 @@ class ChosenKernel(nn.Module):
 
 
 class LearnedKernel(nn.Module):
-    """A kernel for each patch, by a network that sees the rendered and the recorded patch.
+    """A kernel for each patch, predicted from the rendered and the recorded patch.
 
     Args:
         side: Pixels along the edge of a patch.
         seed: Of the run.
         size: Of the kernels, odd.
         edge: What happens at the edges of patches.
-        still_share: Whether the network also says how much of the pixel stays where it is:
+        still_share: Whether the network also predicts the weight of the identity kernel:
             `learned`, as published, or `none`.
     """
 
@@ -122,13 +122,13 @@ class LearnedKernel(nn.Module):
     ) -> Float[Tensor, "m k k"]:
         """The kernel of each patch; it sums to one."""
         grey = torch.cat([recorded.mean(-1).flatten(1), sharp.mean(-1).flatten(1)], -1)
-        said = self.network(grey).sigmoid()
-        moved = said[:, :-1] / said[:, :-1].sum(-1, keepdim=True)
+        out = self.network(grey).sigmoid()  # [m, k k + 1]
+        moved = out[:, :-1] / out[:, :-1].sum(-1, keepdim=True)
         if self.still_share == "none":
             return moved.view(-1, self.size, self.size)
         centre = torch.zeros_like(moved[:1])
         centre[:, self.size**2 // 2] = 1
-        both = said[:, -1:] * moved + (1 - said[:, -1:]) * centre
+        both = out[:, -1:] * moved + (1 - out[:, -1:]) * centre
         return (both / both.sum(-1, keepdim=True)).view(-1, self.size, self.size)
 
     def forward(
@@ -137,7 +137,7 @@ class LearnedKernel(nn.Module):
         recorded: Float[Tensor, "m h w c"],
         known: Float[Tensor, "m h w"],
     ) -> Float[Tensor, "m h w c"]:
-        """Patches blurred to look like recorded ones; see `ChosenKernel`."""
+        """Patches blurred to match recorded ones; see `ChosenKernel`."""
         mask = known[..., None]
         kernels = self.kernels(sharp * mask, recorded)
         light, share = convolve(sharp * mask, kernels), convolve(mask, kernels)
@@ -148,7 +148,7 @@ class LearnedKernel(nn.Module):
 
 
 def _stroke(size: int, ahead: int, behind: int, degrees: int) -> Float[Tensor, "k k"]:
-    """A line from so many pixels ahead of the centre to so many behind, turned to the left."""
+    """A line from `ahead` pixels above the centre to `behind` below it, rotated to the left."""
     middle = size // 2
     line = torch.zeros(size, size, dtype=torch.float64)
     line[middle - ahead : middle + behind + 1, middle] = 1
@@ -157,7 +157,7 @@ def _stroke(size: int, ahead: int, behind: int, degrees: int) -> Float[Tensor, "
 
 
 def _turned(image: Float[Tensor, "k k"], degrees: int) -> Float[Tensor, "k k"]:
-    """An image turned counter-clockwise about its middle, bilinear, zero outside."""
+    """An image rotated counter-clockwise about its middle, bilinear, zero outside."""
     size = len(image)
     middle = size // 2
     cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))

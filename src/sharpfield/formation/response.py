@@ -1,23 +1,19 @@
-"""What an event pixel makes of light: linear rgb in, the log of the photoreceptor's report out.
+"""Event camera response functions: linear RGB to the log of a photoreceptor's output.
 
 A response is called with the light of the rays of some event pairs and with the pairs themselves,
-because a pixel may sit behind a colour filter and a learned response may read the events' signs.
-All of them can take each other's place.
+because a pixel may be behind a colour filter and a learned response may read the events' signs. All
+responses are interchangeable.
 
-Vocabulary: a mono pixel reports *luma*, the weighted sum of three colours; a pixel behind a Bayer
-filter passes one *channel*. `floor` is linear light added before the logarithm; it stands for the
+Vocabulary: a mono pixel measures *luma*, the weighted sum of three colours; a pixel behind a Bayer
+filter measures one *channel*. `floor` is linear light added before the logarithm; it models the
 dark current of a real photoreceptor and keeps the logarithm finite.
 
-Sources: Ev-DeblurNeRF (CVPR 2024), event camera response function; EventNeRF (CVPR 2023), Bayer
-colour; ITU-R BT.601, luma.
+The network of `LearnedResponse` is first fitted to the identity, sigmoid(x + step MLP(x)) = x for x
+in 0...1, by 3000 steps of Adam (`fit_identity`). Its derivatives are written out in numpy: for a
+network of 600 numbers, automatic differentiation would spend nearly all its time on bookkeeping.
 
-Makes the published response curve start near the identity, before training.
-
-The network of `LearnedResponse` is fitted to sigmoid(x + step MLP(x)) = x for x in 0...1 by 3000
-steps of Adam. The derivatives are written out in numpy: on a network of 600 numbers nearly all
-of the time of an automatic gradient would go into bookkeeping.
-
-Source: released code of Ev-DeblurNeRF (CVPR 2024).
+Sources: Ev-DeblurNeRF (CVPR 2024), event camera response function, and its released code; EventNeRF
+(CVPR 2023), Bayer colour; ITU-R BT.601, luma.
 """
 
 import itertools
@@ -48,7 +44,7 @@ def fit_identity(
 
     Args:
         network: Layers with biases and ReLU between them; the first input is x. Further inputs are
-            zero here, so what the network makes of them is left as it was.
+            zero here, so their effect is left as it was.
         step: Factor on the network's output.
         generator: Draws x, uniform in 0...1.
         steps: Of Adam.
@@ -92,18 +88,18 @@ def _slope(layers: Layers, x: Float[np.ndarray, "b 1"], step: float) -> Float[np
 FLOOR = 1e-5
 
 START_SEED = 12
-"""Where the learned curve's first parameters come from.
+"""Seed of the learned curve's initial parameters.
 
-How near the fitted curve comes to the identity depends on them: of seeds 0 to 31, half end with
-phi(0) = 0.08 or more; this one is among the nearest, for either polarity too.
+How close the fitted curve comes to the identity depends on them: of seeds 0 to 31, half end with
+phi(0) = 0.08 or more; this one is among the closest, for either polarity too.
 """
 
 Inputs = Literal["light", "light+polarity"]
-"""What a learned response reads: light alone, or also the pair's counts of each sign."""
+"""Inputs of a learned response: light alone, or also the pair's counts of each sign."""
 
 
 def passed(light: Float[Tensor, "b k c"], seen: EventPairs) -> Float[Tensor, "b k d"]:
-    """The colours that reach each pixel: its own (d = 1) on a Bayer sensor, else all (d = c)."""
+    """The colours that pass a pixel's filter: one (d = 1) on a Bayer sensor, else all (d = c)."""
     if seen.channel is None or light.shape[-1] == 1:
         return light
     channel = seen.channel[:, None, None].expand(*light.shape[:2], 1)

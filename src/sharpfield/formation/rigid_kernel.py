@@ -1,8 +1,8 @@
-"""Blur as a few rigid motions of the camera, learned for each image.
+"""Rigid blurring kernel: blur as a few rigid motions of the camera, learned for each image.
 
-Every pixel of an image is the weighted mean of the same ray under the same handful of small rigid
-motions: the first ray (the *origin*) is the unmoved one, the others follow twists that a network
-reads from a learned code of the image.
+Every pixel of an image is the weighted mean of its ray under the same few small rigid motions: the
+first ray (the *origin*) is unmoved, the motions of the others are twists that a network computes
+from a learned code of the image.
 
 Sources: DP-NeRF (CVPR 2023), section 3.2 (rigid blurring kernel); Ev-DeblurNeRF (CVPR 2024), which
 uses nine motions and the origin. Initial values and the order of the outputs are those of the
@@ -27,7 +27,7 @@ from sharpfield.geometry.rays import cast
 from sharpfield.ops.dense import Dense, FrameVectors
 
 ORIGIN = 0
-"""Index of the unmoved ray, which looks from the middle of the exposure."""
+"""Index of the unmoved ray, at the pose of the middle of the exposure."""
 
 HEAD_BOUND = 1e-5
 """First weights of the motion heads, uniform in plus and minus this; see `RigidMotions`."""
@@ -36,15 +36,15 @@ Centre = Literal["world", "camera"]
 
 
 class RigidMotions(nn.Module):
-    """A few rigid motions and their weights for each image, read from its learned code.
+    """A few rigid motions and their weights for each image, computed from its learned code.
 
-    The codes start at zero, so all images start alike. The weights of the motion heads start near
+    The codes start at zero, so all images start equal. The weights of the motion heads start near
     zero but their biases do not, so the motions start slightly off the identity: by up to
     `window / sqrt(width)`, 0.0177 rad or units on each axis.
 
     Args:
         frames: Images of the capture.
-        motions: Learned motions; the origin comes on top.
+        motions: Learned motions, in addition to the origin.
         code: Width of an image's code.
         width: Of the hidden layer of each of the three branches.
         window: Factor on the network's twists, rad and world units.
@@ -98,8 +98,8 @@ class RigidKernel:
     motions: RigidMotions
     tone: Curve = identity
     centre: Centre = "world"
-    """What the motions turn about: the origin of the model's world, as released, or the camera,
-    in its own axes."""
+    """Centre of the rotations: the origin of the model's world, as released, or the camera, in its
+    own axes."""
 
     def expose(self, seen: Pixels) -> Rays:
         """Rays `[b, k]`: the origin, then one for each motion, all at the middle of the exposure.

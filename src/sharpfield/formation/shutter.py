@@ -1,7 +1,7 @@
-"""Frames without a learned kernel: one instant, or the average over a known or refined motion.
+"""Frames without a learned kernel: one instant, or the mean over a known or refined motion.
 
-Vocabulary: the *light* of a pixel arrives while the shutter is open; `tone` is the curve by which
-the frame stores it, applied after the sum, because blur adds light and not stored values.
+The light of a pixel is integrated while the shutter is open; `tone` is the curve by which the frame
+stores it, applied after the sum, because blur averages light and not stored values.
 
 Source: the physical model behind every method here, e.g. BAD-NeRF (CVPR 2023), eq. 5, with poses
 from a `Trajectory`, which may be learned.
@@ -24,7 +24,7 @@ from sharpfield.geometry.rays import cast
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A shutter that opens for one instant in the middle of the exposure: a sharp pixel."""
+    """A frame without blur: one ray per pixel, at the middle of the exposure."""
 
     camera: Camera
     trajectory: Trajectory
@@ -41,9 +41,9 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class Shutter:
-    """A shutter that is open for a while: the mean of `samples` instants along the trajectory.
+    """A blurred frame: the mean of `samples` instants of the exposure along the trajectory.
 
-    The exposure is cut into `samples` equal parts and the light taken in the middle of each (the
+    The exposure is divided into `samples` equal parts with one ray in the middle of each (the
     midpoint rule, whose error falls with the square of their number). With an odd number, ray
     `samples // 2` is the middle of the exposure.
     """
@@ -58,19 +58,19 @@ class Shutter:
 
         Args:
             seen: Pixels with their exposures.
-            generator: Moves each instant to a random place in its part of the exposure, which
+            generator: Moves each instant to a random time in its part of the exposure, which
                 turns the error of the rule into noise of zero mean. On the device of the pixels.
         """
-        place = torch.arange(self.samples, device=seen.device, dtype=seen.open.dtype)
-        place = place.expand(len(seen), -1)
+        part = torch.arange(self.samples, device=seen.device, dtype=seen.open.dtype)
+        part = part.expand(len(seen), -1)  # [b, samples]
         if generator is None:
-            place = place + 0.5
+            part = part + 0.5
         else:
-            place = place + torch.rand(
-                place.shape, generator=generator, device=place.device, dtype=place.dtype
+            part = part + torch.rand(
+                part.shape, generator=generator, device=part.device, dtype=part.dtype
             )
         duration = seen.close - seen.open
-        time = seen.open[:, None] + duration[:, None] * (place / self.samples)
+        time = seen.open[:, None] + duration[:, None] * (part / self.samples)
         return expose_at(self.camera, self.trajectory, seen, time)
 
     def observe(self, radiance: Radiance, seen: Pixels) -> Float[Tensor, "b c"]:
@@ -85,8 +85,8 @@ def expose_at(
 
     Args:
         camera: Lens and sensor.
-        trajectory: Where the camera is.
-        seen: The pixels; their own exposure is not read.
+        trajectory: Poses of the camera.
+        seen: The pixels; their own exposure is not used.
         time: 0...1 of the capture.
     """
     track = seen.track[:, None].expand_as(time)

@@ -1,8 +1,8 @@
-"""Blur as a few deformed rays for each pixel: a sparse kernel learned for each image and place.
+"""Deformable sparse kernel: blur as a few displaced rays of each pixel, learned for each image.
 
-Each image has a handful of *canonical* points around a pixel. A network moves them, gives each a
-weight and shifts the origin of its ray a little, depending on the image's learned code and on
-where in the image the pixel lies; so the kernel may vary across the image.
+Each image has a few *canonical* points around a pixel. A network displaces them, gives each a
+weight and shifts the origin of its ray a little, depending on the image's learned code and on the
+position of the pixel in the image; so the kernel may vary across the image.
 
 Source: Deblur-NeRF (CVPR 2022), section 3.2 (deformable sparse kernel), 3.3 (ray origins) and 3.4
 (alignment).
@@ -35,31 +35,31 @@ SPREAD, JITTER = 0.1, 0.1
 training, which keeps the network smooth."""
 
 OCTAVES = 2
-"""Of the encoding of a point and of its place in the image."""
+"""Of the encoding of a point and of its position in the image."""
 
 
 @dataclass(frozen=True)
 class Bend(Struct):
-    """How each ray of a pixel departs from the pixel's own."""
+    """Displacement of each ray of a pixel, relative to the pixel's own ray."""
 
     trailing: ClassVar = {"offset_px": 1, "origin": 1}
 
     offset_px: Float[Tensor, "*b 2"]
-    """Where it looks, relative to the pixel."""
+    """Of its position in the image, relative to the pixel."""
     origin: Float[Tensor, "*b 2"]
     """Shift of its origin along the camera's x and y axes, world units."""
     weight: Float[Tensor, "*b"]
 
 
 class SparsePoints(nn.Module):
-    """The network that bends rays.
+    """The network that displaces rays.
 
     Args:
         frames: Images of the capture.
         size: (width, height) of the images.
         points: Rays for each pixel.
         code: Width of an image's code.
-        width: Of the four hidden layers; the layer after them sees the input again.
+        width: Of the four hidden layers; the input is concatenated again after them.
         window_px: Unit of the canonical points, about the half width of a kernel.
         generator: Where the first parameters come from.
     """
@@ -84,15 +84,15 @@ class SparsePoints(nn.Module):
         self.network = Dense([inputs, *4 * [width], 5], generator=generator, skips=(4,))
 
     def forward(self, seen: Pixels, generator: torch.Generator | None = None) -> Bend:
-        """The bend of each pixel's rays; with a generator, the points are jittered."""
+        """Displacements of each pixel's rays; with a generator, the points are jittered."""
         point = self.canonical[seen.frame]  # [b, k, 2]
         if generator is not None:
             noise = torch.randn(
                 point.shape, generator=generator, device=point.device, dtype=point.dtype
             )
             point = point + JITTER * noise
-        place = 2 * seen.xy / seen.xy.new_tensor(self.size) - 1
-        of_pixel = torch.cat([self.codes(seen.frame), frequencies(place, OCTAVES)], -1)
+        position = 2 * seen.xy / seen.xy.new_tensor(self.size) - 1  # -1...1
+        of_pixel = torch.cat([self.codes(seen.frame), frequencies(position, OCTAVES)], -1)
         of_pixel = of_pixel[:, None].expand(-1, point.shape[1], -1)
         out = self.network(torch.cat([frequencies(point, OCTAVES), of_pixel], -1))
         offset, origin, weight = out.split([2, 2, 1], -1)
@@ -105,7 +105,7 @@ class SparsePoints(nn.Module):
 
 @dataclass(frozen=True)
 class SparseKernel:
-    """Blurred pixels as the weighted mean of a few bent rays."""
+    """Blurred pixels as the weighted mean of a few displaced rays."""
 
     camera: Camera
     trajectory: Trajectory
@@ -117,7 +117,7 @@ class SparseKernel:
         return self.follow(self.points(seen), seen)
 
     def follow(self, bend: Bend, seen: Pixels) -> Rays:
-        """Rays of a bend at hand, for recipes that also keep it aligned (`losses.alignment`)."""
+        """Rays of given displacements, for recipes that also regularise them (`alignment`)."""
         time = seen.middle[:, None].expand_as(bend.weight)
         pose = self.trajectory.pose(seen.middle, seen.track)[:, None]
         pose = pose.expand(*bend.weight.shape, 3, 4)

@@ -1,10 +1,8 @@
-"""A capture in a space of its own: near things 4/3 away, the average camera at the origin.
+"""Normalised worlds of a capture.
 
-A capture seen from its middle: what the cameras look at lies in a box from -1 to 1.
-
-For cameras all around a scene, whose average pose means little.
-
-The point that cameras look at.
+- `normalised`: the nearest depth becomes 4/3, the average camera the origin.
+- `recentred`: what the cameras look at lies in a box from -1 to 1. For cameras all around a scene,
+  whose average pose is meaningless.
 """
 
 import dataclasses
@@ -25,13 +23,13 @@ from sharpfield.geometry.trajectory import (
 )
 
 PARALLEL = 1e-3
-"""Mean squared sine of the angles between optical axes, below which they meet nowhere."""
+"""Mean squared sine of the angles between optical axes below which they count as parallel."""
 
 
 def focus(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"] | None:
     """The point nearest to all optical axes, in the least-squares sense.
 
-    None if the axes are nearly parallel, or if most cameras look away from it.
+    None if the axes are nearly parallel, or if the point is behind most cameras.
     """
     centre, forward = poses[:, :, 3], poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # removes what is along an axis
@@ -45,14 +43,14 @@ def focus(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3"] | None:
 
 
 PATH_SAMPLES = 256
-"""Instants at which a trajectory without frames of its own is looked at."""
+"""Instants at which a trajectory without frames is sampled."""
 
 
 def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
-    """The poses that stand for a capture: its frames', or the moving track's.
+    """The poses over which a capture is normalised: its frames', or those of its moving track.
 
-    Published data sets average over one or the other; `Capture.known.reference_poses` says which.
-    Without frames it is the trajectory, of all cameras if they stand still.
+    Published data sets average over one or the other, see `Capture.known.reference_poses`. Without
+    frames it is the trajectory, of all cameras if they are static.
     """
     known = capture.trajectory.known_us(0)
     along = capture.known.reference_poses == "trajectory" or capture.frames is None
@@ -65,7 +63,7 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
         time = torch.linspace(start, end, PATH_SAMPLES)
         along_it = capture.trajectory.pose(time, torch.zeros(PATH_SAMPLES, dtype=torch.int64))
         return along_it.detach().double().numpy()
-    if capture.frames is None:  # cameras that stand still
+    if capture.frames is None:  # static cameras
         track = torch.arange(count_tracks(capture.trajectory))
         return capture.trajectory.pose(torch.zeros(len(track)), track).detach().double().numpy()
     every = np.arange(len(capture.frames))
@@ -73,13 +71,13 @@ def reference_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
 
 
 def normalised(capture: Capture) -> tuple[Capture, Similarity]:
-    """The capture in its normalised world, and the change that leads there."""
+    """The capture in its normalised world, and the similarity that leads there."""
     change = normalisation(reference_poses(capture), capture.near)
     return moved(capture, change), change
 
 
 def moved(capture: Capture, change: Similarity) -> Capture:
-    """A capture seen from another world."""
+    """A capture in another world."""
     frames = capture.frames
     if frames is not None and frames.depth is not None:
         frames = dataclasses.replace(frames, depth=frames.depth * np.float32(change.scale))
@@ -98,10 +96,10 @@ def moved(capture: Capture, change: Similarity) -> Capture:
 
 
 def change_of(capture: Capture) -> Similarity:
-    """The change of world that a normalised capture went through; of any other, none.
+    """The similarity that a normalised capture was transformed by; of any other, the identity.
 
-    It brings what is known in the world of the capture on disk, a camera's path for instance, to
-    where a model lives.
+    It maps the world of the capture on disk, in which a camera path may be given, to that of a
+    model.
     """
     path: object = capture.trajectory
     while isinstance(path, LearnedKnots | LearnedExposureMotion):
@@ -111,11 +109,11 @@ def change_of(capture: Capture) -> Similarity:
     return Similarity(1.0, np.eye(3), np.zeros(3))
 
 
-def centred(capture: Capture) -> tuple[Capture, Similarity]:
-    """The capture in a world whose box from -1 to 1 holds what its cameras look at.
+def recentred(capture: Capture) -> tuple[Capture, Similarity]:
+    """The capture in a world in which its cameras look at a box from -1 to 1.
 
-    The box is as wide as what a camera sees around the point that all look at, and nothing of it is
-    nearer than the capture's nearest depth. Where there is no such point, it is the one half way
+    The box is as wide as the field of view around the point that all cameras look at, and no part
+    of it is nearer than the capture's nearest depth. Where there is no such point, it is half way
     between the nearest and the farthest depth.
     """
     poses = reference_poses(capture)
@@ -125,7 +123,7 @@ def centred(capture: Capture) -> tuple[Capture, Similarity]:
         point = (centre + (capture.near + capture.far) / 2 * forward).mean(0)
     distance = float(np.linalg.norm(centre - point, axis=1).mean())
     camera = capture.camera
-    seen = distance * max(camera.width / camera.fx_px, camera.height / camera.fy_px) / 2
-    half = min(seen, max(distance - capture.near, 0.1 * distance))
+    view = distance * max(camera.width / camera.fx_px, camera.height / camera.fy_px) / 2
+    half = min(view, max(distance - capture.near, 0.1 * distance))
     change = Similarity(1 / half, np.eye(3), -point / half)
     return moved(capture, change), change

@@ -1,4 +1,4 @@
-"""A camera, its pose and a pixel make a ray."""
+"""Rays of pixels, from a camera and its pose."""
 
 from jaxtyping import Float
 from torch import Tensor

@@ -1,7 +1,7 @@
-"""Where the camera is while a rolling shutter reads an image row by row.
+"""Poses of a camera with a rolling shutter, which reads an image row by row.
 
-All times of a frame or of a view are those of its first row; the last row follows after the
-*readout*. A view's own pose is that of its middle row.
+The times of a frame or view are those of its first row; the last row follows after the *readout*
+time. The pose of a view is that of its middle row.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry import se3
 
 KNOTS = 5
-"""Poses over a readout; the motion between two of them is taken as even."""
+"""Poses over a readout; the motion between two of them is taken as uniform."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Rolling:
 
     @classmethod
     def of(cls, capture: Capture, *, along: Trajectory | None = None) -> "Rolling":
-        """As the capture's frames say; along another trajectory than its own if one is given."""
+        """That of a capture's frames; along another trajectory than its own if one is given."""
         frames = capture.frames
         readout = 0.0 if frames is None else frames.exposure.readout_us(frames.height)
         return cls(along or capture.trajectory, readout / capture.clock.span_us)
@@ -36,13 +36,13 @@ class Rolling:
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
     ) -> Float[Tensor, "*b 3 4"]:
-        """When the middle row is read."""
+        """Poses at the time when the middle row is read."""
         return self.trajectory.pose(time + self.readout / 2, track)
 
     def rows(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
     ) -> Float[Tensor, "*b q 3 4"] | None:
-        """From the first row to the last, evenly in time; None if all are read at once.
+        """Poses from the first row to the last, evenly in time; None for a global shutter.
 
         Args:
             time: Of the first row, 0...1 of the capture.
@@ -50,15 +50,15 @@ class Rolling:
         """
         if self.readout == 0:
             return None
-        place = torch.linspace(0, 1, KNOTS, device=time.device, dtype=time.dtype)
-        times = time[..., None] + self.readout * place
+        fraction = torch.linspace(0, 1, KNOTS, device=time.device, dtype=time.dtype)
+        times = time[..., None] + self.readout * fraction  # [*b, q]
         return self.trajectory.pose(times, track[..., None].expand_as(times))
 
 
 def moved_rows(
     rows: Float[Tensor, "q 3 4"] | None, start: Float[Tensor, "3 4"], pose: Float[Tensor, "3 4"]
 ) -> Float[Tensor, "q 3 4"] | None:
-    """The rows of a view after its own pose was changed."""
+    """The poses of the rows of a view after the pose of the view was changed."""
     if rows is None:
         return None
     moved = se3.compose(pose, se3.inverse(start.to(pose)))

@@ -1,8 +1,8 @@
-"""Spaces: where a scene sits, and how rays run through it.
+"""Spaces in which a scene is sampled: normalised device coordinates (NDC), or metric depth.
 
-A recipe works in its own space: scaled so that the nearest thing is 4/3 away, and centred on the
-average camera. On top of that a volume is sampled either in normalised device coordinates (NDC),
-which turn a view frustum into a cube, or in plain metric depth.
+A recipe works in a normalised world: the nearest depth is 4/3, and the average camera is the
+origin. In that world a volume is sampled either in NDC, which map a view frustum to a cube, or
+evenly in depth.
 
 Axes are OpenCV's (y down, z forward), so NDC here is the mirror image, in y, of the customary
 one. Source: LLFF (SIGGRAPH 2019) for the normalisation; NeRF (ECCV 2020), appendix C, for NDC.
@@ -28,19 +28,19 @@ FORWARD_DEG = 60.0
 """Cameras that all look within this of their average direction make a forward-facing scene."""
 
 CANCELLED = 1e-6
-"""Length of a mean of directions below which it says nothing."""
+"""Length of a mean of directions below which it has no direction."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """The change of world `p -> scale * rotation @ p + translation`."""
+    """The similarity transform `p -> scale * rotation @ p + translation`."""
 
     scale: float
     rotation: Float[np.ndarray, "3 3"]
     translation: Float[np.ndarray, "3"]
 
     def points(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-        """Move points."""
+        """Transformed points."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def poses(self, poses: Float[np.ndarray, "*n 3 4"]) -> Float[np.ndarray, "*n 3 4"]:
@@ -49,7 +49,7 @@ class Similarity:
         return np.concatenate([self.rotation @ poses[..., :3], centre[..., None]], -1)
 
     def inverse(self) -> "Similarity":
-        """The change back."""
+        """The inverse transform."""
         back = self.rotation.T / self.scale
         return Similarity(1 / self.scale, self.rotation.T, -back @ self.translation)
 
@@ -57,7 +57,7 @@ class Similarity:
 def average_pose(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
     """A camera at the mean position that looks along the mean direction.
 
-    Where directions cancel, as on a ring, that of the first camera stands for them.
+    Where directions cancel, as on a ring, that of the first camera is taken.
     """
     forward = _mean_direction(poses[:, :, 2])
     across = np.cross(_mean_direction(poses[:, :, 1]), forward)
@@ -67,7 +67,7 @@ def average_pose(poses: Float[np.ndarray, "n 3 4"]) -> Float[np.ndarray, "3 4"]:
 
 
 def normalisation(poses: Float[np.ndarray, "n 3 4"], near: float) -> Similarity:
-    """The change that puts the nearest thing 4/3 away and the average camera at the origin.
+    """The similarity after which the nearest depth is 4/3 and the average camera at the origin.
 
     Args:
         poses: World-from-camera poses the average is taken over.
@@ -80,7 +80,7 @@ def normalisation(poses: Float[np.ndarray, "n 3 4"], near: float) -> Similarity:
 
 
 def forward_facing(poses: Float[np.ndarray, "n 3 4"]) -> bool:
-    """Whether all cameras look roughly the same way, so that NDC can hold the scene."""
+    """Whether all cameras look in roughly the same direction, so that NDC fit the scene."""
     forward = _mean_direction(poses[:, :, 2])
     return bool((poses[:, :, 2] @ forward > np.cos(np.radians(FORWARD_DEG))).all())
 
@@ -100,7 +100,7 @@ def ndc(
         near: Depth of the plane that becomes z = 0.
 
     Returns:
-        Origin on the near plane, and a direction whose length matters.
+        Origin on the near plane, and a direction that is not normalised.
     """
     depth = (near - origin[..., 2:]) / direction[..., 2:]
     start = origin + depth * direction
@@ -113,7 +113,7 @@ def ndc(
 
 @dataclass(frozen=True)
 class Frustum:
-    """A volume sampled in NDC: near things densely, far things to infinity."""
+    """A volume sampled in NDC: densely near the cameras, and out to infinity."""
 
     camera: Camera
     near: float = 0.0
@@ -128,7 +128,7 @@ class Frustum:
         return 1 / (1 - z).clamp_min(1e-6)
 
     def box(self, poses: Float[Tensor, "n 3 4"]) -> Float[Tensor, "2 3"]:
-        """Corners of a box around what the cameras see (PDRF): low, high."""
+        """Corners of a box around the view frusta (PDRF): low, high."""
         origin, direction = ndc(*_corner_rays(self.camera, poses), self.camera)
         ends = torch.cat([origin.reshape(-1, 3), (origin + direction).reshape(-1, 3)])
         margin = ends.new_tensor(BOX_MARGIN)
@@ -152,7 +152,7 @@ class Metric:
         return z
 
     def box(self, poses: Float[Tensor, "n 3 4"]) -> Float[Tensor, "2 3"]:
-        """Corners of a box around what the cameras see between near and far: low, high."""
+        """Corners of a box around the view frusta between near and far: low, high."""
         origin, direction = _corner_rays(self.camera, poses)
         ends = torch.cat([(origin + z * direction).reshape(-1, 3) for z in (self.near, self.far)])
         return torch.stack([ends.amin(0), ends.amax(0)])

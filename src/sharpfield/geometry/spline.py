@@ -22,7 +22,7 @@ def cubic_coefficients(
 
     Args:
         times: Strictly ascending.
-        values: What to pass through.
+        values: That the curve passes through.
 
     Returns:
         c such that the value at `times[i] + s` is c[i,0] + c[i,1] s + c[i,2] s^2 + c[i,3] s^3.
@@ -73,7 +73,7 @@ def bspline_weights(u: Float[Tensor, "*b"]) -> Float[Tensor, "*b 4"]:
     """Weights of four neighbouring knots in a uniform cubic B-spline; they sum to one.
 
     Args:
-        u: Place between the middle two knots, 0...1.
+        u: Position between the middle two knots, 0...1.
     """
     u2, u3 = u * u, u * u * u
     return (

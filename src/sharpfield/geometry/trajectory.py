@@ -1,9 +1,7 @@
-"""Where a camera is at any time. A camera has no pose; a trajectory at a time has.
+"""Trajectories: the pose of a camera at any time; known, refined, or learned from blur alone.
 
 Poses are world-from-camera, OpenCV axes. Times given to `pose` are 0...1 of the capture and are
-clamped to what is known. A *track* is one camera's path; see `core.protocols.Trajectory`.
-
-Motion of the camera inside each exposure, where nothing but the blur tells of it.
+clamped to the known interval. A *track* is one camera's path; see `core.protocols.Trajectory`.
 """
 
 from collections.abc import Sequence
@@ -130,7 +128,7 @@ def _line(times: Float[np.ndarray, "p"], values: Float[np.ndarray, "p d"]) -> np
 
 
 class Still(nn.Module):
-    """Tracks that stand still: one pose each, at any time."""
+    """Static tracks: one pose each, at any time."""
 
     fixed: Float[Tensor, "n 3 4"]
 
@@ -152,7 +150,7 @@ class Still(nn.Module):
 
 
 class Tracks(nn.Module):
-    """Several tracks: first those that move, then those that stand still."""
+    """Several tracks: first those that move, then the static ones."""
 
     moving: Sequence[Trajectory]
 
@@ -164,7 +162,7 @@ class Tracks(nn.Module):
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
     ) -> Float[Tensor, "*b 3 4"]:
-        """World-from-camera on each one's track."""
+        """World-from-camera, each on its track."""
         count = len(self.moving)
         if count and bool((track == 0).all()):
             return self.moving[0].pose(time, track)
@@ -206,11 +204,11 @@ class BSpline(nn.Module):
         """World-from-camera at a time; there is one track."""
         start, end = (float(self.clock.unit(t)) for t in (self.start_us, self.end_us))
         segments = len(self.knots) - 3
-        place = ((time - start) / (end - start)).clamp(0, 1) * segments
-        i = place.detach().long().clamp(0, segments - 1)
+        u = ((time - start) / (end - start)).clamp(0, 1) * segments
+        i = u.detach().long().clamp(0, segments - 1)
         moved = se3.compose(self.knots, se3.exp(self.twist.to(self.knots.dtype)))
-        near = i[..., None] + torch.arange(4, device=time.device)
-        return spline.bspline(moved[near], (place - i).to(moved.dtype)).to(time.dtype)
+        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
+        return spline.bspline(moved[near], (u - i).to(moved.dtype)).to(time.dtype)
 
     def known_us(self, track: int) -> tuple[int, int]:
         """The time its segments span."""
@@ -236,10 +234,10 @@ class LearnedKnots(nn.Module):
     ) -> Float[Tensor, "*b 3 4"]:
         """The base's pose, corrected."""
         segments = self.twist.shape[1] - 3
-        place = time.clamp(0, 1) * segments
-        i = place.detach().long().clamp(0, segments - 1)
-        near = i[..., None] + torch.arange(4, device=time.device)
-        weights = spline.bspline_weights(place - i)
+        u = time.clamp(0, 1) * segments
+        i = u.detach().long().clamp(0, segments - 1)
+        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
+        weights = spline.bspline_weights(u - i)
         twist = (weights[..., None] * self.twist[track[..., None], near]).sum(-2)
         return se3.compose(self.base.pose(time, track), se3.exp(twist))
 
@@ -249,7 +247,7 @@ class LearnedKnots(nn.Module):
 
 
 class Moved(nn.Module):
-    """A trajectory seen from another world: scaled, turned and shifted."""
+    """A trajectory in another world: scaled, rotated and translated."""
 
     rotation: Float[Tensor, "3 3"]
     translation: Float[Tensor, "3"]
@@ -289,13 +287,13 @@ def count_tracks(path: Trajectory) -> int:
 
 
 class LearnedExposureMotion(nn.Module):
-    """A trajectory whose tracks are photos, each with a learned motion while its shutter is open.
+    """A trajectory whose tracks are photos, each with a learned motion over its exposure.
 
-    The motion is a cubic B-spline of twists in camera axes over the exposure; outside of it the
-    camera stands still.
+    The motion is a cubic B-spline of twists in camera axes; outside the exposure the camera is
+    static.
 
     Args:
-        base: Where each photo was taken.
+        base: The pose of each photo.
         opens: When each track's shutter opened, 0...1 of the capture.
         closes: When it closed; later.
         knots: Of each spline, at least 4.
@@ -326,13 +324,13 @@ class LearnedExposureMotion(nn.Module):
     def pose(
         self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"]
     ) -> Float[Tensor, "*b 3 4"]:
-        """World-from-camera, moved as learned."""
+        """World-from-camera, with the learned motion."""
         segments = self.twist.shape[1] - 3
         opens, closes = self.opens[track], self.closes[track]
-        place = ((time - opens) / (closes - opens)).clamp(0, 1) * segments
-        i = place.detach().long().clamp(0, segments - 1)
-        near = i[..., None] + torch.arange(4, device=time.device)
-        weights = spline.bspline_weights(place - i)
+        u = ((time - opens) / (closes - opens)).clamp(0, 1) * segments
+        i = u.detach().long().clamp(0, segments - 1)
+        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
+        weights = spline.bspline_weights(u - i)
         twist = (weights[..., None] * self.twist[track[..., None], near]).sum(-2)
         return se3.compose(self.base.pose(time, track), se3.exp(twist))
 

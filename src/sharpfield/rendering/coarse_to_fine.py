@@ -1,4 +1,4 @@
-"""Light along rays in two stages: look everywhere coarsely, then closely where the light is.
+"""Hierarchical volume rendering: coarse samples, then fine samples by importance.
 
 Source: NeRF (ECCV 2020), section 5.2; the released code of Ev-DeblurNeRF for the details of
 sampling and compositing.
@@ -14,15 +14,15 @@ from sharpfield.core.protocols import Field
 from sharpfield.core.rays import Radiance, Rays, Samples
 from sharpfield.geometry.space import Space
 from sharpfield.ops import stepfun
-from sharpfield.rendering.head_compositing import Compositing, Work, composite_head
+from sharpfield.rendering.head_compositing import Compositing, RayPoints, composite_head
 
 
 @dataclass(frozen=True)
 class CoarseToFine:
     """Volume rendering with importance sampling.
 
-    Points are jittered and densities noisy when a generator is given, which training does;
-    without one the result depends on the rays alone.
+    With a generator, as in training, points are jittered and noise is added to densities; without
+    one the result depends on the rays only.
     """
 
     field: Field
@@ -36,7 +36,7 @@ class CoarseToFine:
     def __call__(
         self, rays: Rays, generator: Generator | None = None, *, samples: bool = False
     ) -> Radiance:
-        """Radiance of rays of any shape; with `samples`, also the points it came from."""
+        """Radiance of rays of any shape; with `samples`, also the features along them."""
         found = self._both(rays.reshape(-1), generator, samples=samples)
         return found.reshape(*rays.shape)
 
@@ -48,16 +48,16 @@ class CoarseToFine:
             return origin[:, None] + z[..., None] * direction[:, None]
 
         z = self._coarse_depths(rays, generator)
-        looked = self.field.look(at(z), rays.time)
-        work = Work(
-            looked, at(z), z, length, rays.direction, noise=self._noise(z.shape, generator, rays)
+        features = self.field.coarse_features(at(z), rays.time)
+        work = RayPoints(
+            features, at(z), z, length, rays.direction, noise=self._noise(z.shape, generator, rays)
         )
         coarse = composite_head(self.field.coarse, work, self.how)
 
         more = stepfun.resample_points(z, coarse.weights.detach(), self._positions(rays, generator))
         both, order = stepfun.merge(z, more)
-        work = Work(
-            self.field.look_closer(looked, at(z), at(more), rays.time),
+        work = RayPoints(
+            self.field.fine_features(features, at(z), at(more), rays.time),
             torch.cat([at(z), at(more)], -2),
             both,
             length,

@@ -1,12 +1,12 @@
-"""Light along rays through a cloud of neural points.
+"""Volume rendering of a cloud of neural points.
 
-Rays are looked at in small steps; the first steps that come near a point are *asked*, each by the
-points around it. What is asked has a density; it stops light as if it were one voxel thick, however
-long the step. Colours are only worked out where light comes from, and blended as frames store them.
-A ray that comes near no point at all has *missed*: it shows the background.
+Rays are sampled in small steps; the first samples near a point are *shaded*, each from the points
+around it. A shaded sample has a density and absorbs light as if it were one voxel thick, however
+long the step. Colours are computed only where the weight is not negligible, and blended as stored
+values. A ray without any near point is a *miss* and has the background's colour.
 
-Source: Point-NeRF (CVPR 2022), section 4.1. In the released code the thickness comes about because
-steps are longer than two voxels, which it takes for gaps.
+Source: Point-NeRF (CVPR 2022), section 4.1. In the released code the thickness results from steps
+longer than two voxels, which it treats as gaps.
 """
 
 from collections.abc import Callable
@@ -21,19 +21,19 @@ from sharpfield.core.rays import Rays
 from sharpfield.core.struct import Struct
 from sharpfield.ops import compositing
 
-UNSEEN = 1e-4
-"""In evaluation, colour is left out where a sample's share of the light is below this."""
+MIN_WEIGHT_EVAL = 1e-4
+"""In evaluation, colour is not computed for samples of a smaller weight."""
 
-SPECK = 1e-7
-"""The same in training, where it must not show in any gradient."""
+MIN_WEIGHT_TRAIN = 1e-7
+"""The same in training, where it must not affect any gradient."""
 
 UNEVEN = 0.3
-"""Steps differ in length by up to this share in training."""
+"""In training, the length of steps varies by up to this fraction."""
 
 
 @runtime_checkable
 class Points(Protocol):
-    """What rays run through, see `fields.PointField`."""
+    """A field of points, see `fields.points.networks.PointField`."""
 
     def near(
         self,
@@ -42,13 +42,13 @@ class Points(Protocol):
         place: Float[Tensor, "b d"],
         most: int,
     ) -> tuple[Int64[Tensor, "b s"], Float[Tensor, "b s 3"]]:
-        """The first of the places on rays that lie near points, and where they are."""
+        """The first of the samples on rays that are near points, and their positions."""
         ...
 
     def neighbours(
         self, places: Float[Tensor, "q 3"]
     ) -> tuple[Int64[Tensor, "q k"], Float[Tensor, "q k 3"]]:
-        """Rows of the points around places, and the ways to them."""
+        """Rows of the points around positions, and the offsets to them."""
         ...
 
     def density(
@@ -58,69 +58,69 @@ class Points(Protocol):
         direction: Float[Tensor, "q 3"],
         turn: Float[Tensor, "q 3 3"] | None = None,
     ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q h"]]:
-        """Density of places, and what their colour is made from."""
+        """Density at positions, and the hidden features from which colour is computed."""
         ...
 
 
 @dataclass(frozen=True)
-class Asked(Struct):
-    """Places on rays that send light."""
+class ShadedSamples(Struct):
+    """Samples on rays that have a colour."""
 
     trailing: ClassVar = dict.fromkeys(("place", "rows", "way", "hidden", "direction"), 1) | {
         "way": 2
     }
 
     ray: Int64[Tensor, "*n"]
-    """Number of the ray each lies on."""
+    """Index of the ray of each."""
     place: Float[Tensor, "*n 3"]
     rows: Int64[Tensor, "*n k"]
     """Points around it, -1 where there are no more."""
     way: Float[Tensor, "*n k 3"]
-    """To each of them."""
+    """Offset to each of them."""
     hidden: Float[Tensor, "*n h"]
-    """What its colour is made from."""
+    """Features from which its colour is computed."""
     direction: Float[Tensor, "*n 3"]
-    """In which it is looked at; its length matters."""
+    """Of the ray; not normalised."""
 
 
-Colour = Callable[[Asked], Float[Tensor, "n c"]]
-"""From places to their colours, as frames store them."""
+Colour = Callable[[ShadedSamples], Float[Tensor, "n c"]]
+"""From samples to their colours, as stored values."""
 
 
 @dataclass(frozen=True)
-class Met:
-    """What rays met."""
+class PointRadiance:
+    """The result for each ray."""
 
     colour: Float[Tensor, "b c"]
-    """As frames store it."""
+    """Stored values."""
     depth: Float[Tensor, "b"]
     """Expected ray parameter; along the camera's axis where rays have its rotation."""
     opacity: Float[Tensor, "b"]
     hit: Bool[Tensor, "b"]
     """Whether any point was near."""
     rows: Int64[Tensor, "n k"]
-    """Points around all places that were asked."""
+    """Points around all shaded samples."""
     densest: Float[Tensor, "b"]
-    """The largest opacity of a single place."""
+    """The largest opacity of a single sample."""
     where: Float[Tensor, "b 3"]
-    """That place."""
+    """Position of that sample."""
 
 
 @dataclass(frozen=True)
 class PointMarch:
-    """How rays run through points."""
+    """Volume rendering along rays through points."""
 
     points: Points
     near: float
-    """Ray parameter where steps begin."""
+    """Ray parameter of the first step."""
     far: float
     steps: int = 400
     asked: int = 24
-    """Most places of a ray near which points are looked for."""
+    """Most shaded samples of a ray."""
     thickness: float = 0.008
-    """Of what stops light at each place: opacity is 1 - exp(-density thickness)."""
+    """Of the absorbing voxel at each sample: opacity is 1 - exp(-density thickness)."""
     background: float = 1.0
-    """Behind everything, as frames store it."""
+    """Colour behind everything, a stored value."""
 
     def __call__(
         self,
@@ -129,12 +129,12 @@ class PointMarch:
         *,
         turn: Float[Tensor, "b 3 3"] | None = None,
         generator: Generator | None = None,
-    ) -> Met:
-        """What rays meet.
+    ) -> PointRadiance:
+        """Colour, depth and opacity of rays.
 
         Args:
             rays: On one leading axis.
-            colour: Of the places that send light.
+            colour: Computes the colour of samples.
             turn: Camera-from-world rotations. Directions then reach up to the plane at depth 1, so
                 that the ray parameter is depth.
             generator: Makes steps uneven, for training.
@@ -154,11 +154,11 @@ class PointMarch:
         spread = density.new_zeros(which.numel()).index_copy(0, asked, density)
         spread = spread.view(which.shape)
         weights = compositing.weigh(spread, torch.full_like(spread, self.thickness))
-        share = weights.flatten()[asked]
-        seen = torch.nonzero(share > (SPECK if torch.is_grad_enabled() else UNSEEN))[:, 0]
+        least = MIN_WEIGHT_TRAIN if torch.is_grad_enabled() else MIN_WEIGHT_EVAL
+        seen = torch.nonzero(weights.flatten()[asked] > least)[:, 0]
         at = asked[seen]
         light = colour(
-            Asked(
+            ShadedSamples(
                 ray[seen],
                 places.flatten(0, 1)[at],
                 rows[seen],
@@ -171,7 +171,7 @@ class PointMarch:
         mixed = compositing.gather_kept(weights, at, light)
         hit = torch.zeros_like(opacity, dtype=torch.bool).index_fill(0, ray, True)
         densest, best = spread.detach().max(-1)
-        return Met(
+        return PointRadiance(
             colour=mixed + self.background * (1 - opacity)[:, None],
             depth=(weights * depth.gather(-1, which.clamp_min(0))).sum(-1),
             opacity=opacity,

@@ -1,8 +1,8 @@
-"""Gaussians drawn as whole views.
+"""Views of Gaussians, by rasterization.
 
-What Gaussians send are *stored* values, as frames hold them and the files of splat viewers expect;
-a tone curve turns them into linear light before they are blended, because light is what adds up.
-Depth is the distance along the optical axis, in world units.
+The colours of Gaussians are *stored* values, as in frames and in the files of splat viewers; a tone
+curve turns them into linear light before they are blended, because light adds up and stored values
+do not. Depth is the distance along the optical axis, in world units.
 """
 
 from collections.abc import Callable
@@ -46,13 +46,13 @@ class Cloud(Protocol):
         ...
 
     def colours(self, seen_from: Float[Tensor, "v 3"]) -> Float[Tensor, "v n c"]:
-        """Stored values sent to some places, not below zero."""
+        """Stored values seen from some positions, not below zero."""
         ...
 
 
 @dataclass(frozen=True)
 class Splatting:
-    """How a cloud of Gaussians is drawn."""
+    """Renders Gaussians with a camera of any lens, and a global or rolling shutter."""
 
     camera: Camera
     decode: Callable[[Tensor], Tensor]
@@ -68,10 +68,10 @@ class Splatting:
         shift: Float[Tensor, "v n 2"] | None = None,
         drift: Float[Tensor, "n 3"] | None = None,
     ) -> Radiance:
-        """Linear light of whole views.
+        """Linear light of views.
 
         Args:
-            cloud: What is drawn.
+            cloud: The Gaussians.
             views: `[m, k]`: the k views that explain each of m measurements.
             shift: Moves splats in pixels, see `ops.rasterizer`; v = m k.
             drift: How far Gaussians move while a rolling shutter reads an image, see `row_shift`.
@@ -81,10 +81,10 @@ class Splatting:
 
         Raises:
             MissingExtra: On a GPU, without gsplat.
-            OptionError: The lens sees too wide, see `flattened`.
+            OptionError: The field of view is too wide, see `flattened`.
         """
         if views.device.type == "cuda":
-            # The definition would run, and need more memory than any card has.
+            # The reference implementation would run, and need more memory than any GPU has.
             need("gsplat", extra="gpu", purpose="drawing Gaussians on a GPU")
         m, k = views.shape
         poses = views.pose.reshape(-1, 3, 4)
@@ -96,8 +96,8 @@ class Splatting:
             canvas, where = flat.canvas(corner, views.size, antialiased=self.antialiased)
         if views.rows is not None:
             rows = views.rows.reshape(m * k, -1, 3, 4)
-            late = row_shift(cloud.means, poses, rows, self.camera, canvas.camera, drift)
-            shift = late if shift is None else shift + late
+            rolling = row_shift(cloud.means, poses, rows, self.camera, canvas.camera, drift)
+            shift = rolling if shift is None else shift + rolling
         drawn = rasterize(
             cloud.means,
             cloud.quaternions,

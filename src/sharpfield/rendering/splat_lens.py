@@ -1,8 +1,8 @@
-"""Images through lenses that bend straight lines, taken from images that do not.
+"""Images of Gaussians through lenses with distortion, resampled from pinhole images.
 
-A *flat* image is one of a pinhole camera. It is drawn just wide enough and fine enough, and every
-pixel of the real camera takes what the flat image shows where its own ray meets it, between the
-four nearest flat pixels. The optical axis is the same, so that depth along it stays what it is.
+A *flat* image is that of a pinhole camera with the same pose, just wide and fine enough. Every
+pixel of the real camera takes the bilinear interpolation of the flat image at the position of its
+ray. Both have the same optical axis, so that depth along it stays the same.
 """
 
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ from sharpfield.core.errors import OptionError
 from sharpfield.ops.rasterizer import Canvas, Drawn
 
 STEEPEST = 5.0
-"""Largest distance from the optical axis on the plane z = 1 that is drawn: 79 degrees."""
+"""Largest distance from the optical axis on the plane z = 1 that is rendered: 79 degrees."""
 
 MOST_PIXELS = 4.0
-"""Pixels of a flat image, for each of the real one; beyond, it is drawn coarser."""
+"""Most pixels of a flat image per pixel of the real one; beyond, it is rendered coarser."""
 
 RIM_PX = 2
-"""Flat pixels beyond the outermost ray."""
+"""Margin of the flat image beyond the outermost ray."""
 
 
 @dataclass(frozen=True)
 class Flat:
-    """The flat image of a camera, and where each pixel of the camera looks on it."""
+    """The flat image of a camera, and the position on it of each pixel of the camera."""
 
     camera: Camera
     """Without distortion."""
@@ -39,7 +39,7 @@ class Flat:
     def canvas(
         self, corner: Int64[Tensor, "v 2"], size: tuple[int, int], *, antialiased: bool
     ) -> tuple[Canvas, Float[Tensor, "v h w 2"]]:
-        """What must be drawn for parts of the real image, and where their pixels lie on that.
+        """The canvas to render for parts of the real image, and their pixels' positions on it.
 
         Args:
             corner: Pixel at the upper left of each part.
@@ -61,7 +61,7 @@ def flattened(camera: Camera) -> Flat:
     """The flat image for a camera: as fine as the finest part of the real one.
 
     Raises:
-        OptionError: The lens sees so wide that no flat image holds it.
+        OptionError: The field of view is too wide for a pinhole image.
     """
     ray = camera.direction(camera.grid().double())
     ahead = ray[..., 2:] > 0
@@ -69,7 +69,7 @@ def flattened(camera: Camera) -> Flat:
     if not (plane.norm(dim=-1) < STEEPEST).all():
         angle = torch.rad2deg(torch.acos(ray[..., 2].min()))
         raise OptionError(
-            "the lens sees too wide for images of Gaussians",
+            "the field of view is too wide for images of Gaussians",
             got=f"{angle:.0f} degrees from the optical axis at the corner",
             do="crop the recording to 75 degrees, or use a recipe that renders rays",
         )
@@ -77,7 +77,7 @@ def flattened(camera: Camera) -> Flat:
     focal = _finest(plane)
     pixels = float((high - low).prod()) * focal**2
     focal = focal * min(1.0, MOST_PIXELS * camera.width * camera.height / pixels) ** 0.5
-    # Pixels of the two images coincide on the axis, where most lenses bend next to nothing.
+    # Pixels of the two images coincide on the axis, where most lenses have next to no distortion.
     cx, cy = (
         centre + ceil(RIM_PX - min(float(edge), 0.0) * focal - centre)
         for edge, centre in zip(low, (camera.cx_px, camera.cy_px), strict=True)
@@ -92,7 +92,7 @@ def flattened(camera: Camera) -> Flat:
 
 
 def resampled(drawn: Drawn, where: Float[Tensor, "v h w 2"]) -> Drawn:
-    """What a drawn image shows at positions on it, between its four nearest pixels."""
+    """Bilinear interpolation of a rendered image at positions on it."""
     height, width = drawn.opacity.shape[1:]
     flat = torch.cat([drawn.light, drawn.depth[..., None], drawn.opacity[..., None]], -1)
     span = where.new_tensor([width, height])

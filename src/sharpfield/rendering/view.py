@@ -1,4 +1,4 @@
-"""A full image: one camera at one pose and time, drawn whole or in chunks of rays."""
+"""Render a full image of one camera at one pose and time, as a view or in chunks of rays."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -13,15 +13,15 @@ from sharpfield.geometry.rays import cast
 from sharpfield.rendering.splat import whole
 
 CHUNK = 4096
-"""Rays rendered at once unless told otherwise; small enough for any machine."""
+"""Rays rendered at once by default; small enough for any machine."""
 
 Progress = Callable[[int, int], None]
-"""Told after each chunk how many pixels are done, and how many there are."""
+"""Called after each chunk with the number of finished pixels, and of all pixels."""
 
 
 @runtime_checkable
 class ViewRenderer(Protocol):
-    """A model that draws whole views, much faster than ray by ray."""
+    """A model that renders whole views, much faster than ray by ray."""
 
     def draw_views(self, views: Views) -> Radiance:
         """Linear light of views `[m, k]`, as `[m, h, w, k]`."""
@@ -38,7 +38,7 @@ class RayRenderer(Protocol):
 
 
 def renderer_of(model: RayRenderer) -> Callable[[Rays], Radiance] | ViewRenderer:
-    """What `render_view` should ask of a model."""
+    """The renderer of a model that `render_view` uses."""
     return model if isinstance(model, ViewRenderer) else model.render
 
 
@@ -56,16 +56,16 @@ def render_view(
     """Sharp linear light at every pixel of a camera.
 
     Args:
-        render: From rays to radiance, or something that draws the view whole; see `renderer_of`.
+        render: From rays to radiance, or a renderer of whole views; see `renderer_of`.
         camera: Gives the size of the image.
         pose: World-from-camera, in the renderer's world; the rays are made on its device.
         time: 0...1 of the capture.
-        rows: Poses of a rolling shutter, see `Views`; only for what draws views.
-        chunk: Rays rendered at once. Less needs less memory and gives the same image.
+        rows: Poses of a rolling shutter, see `Views`; only for renderers of whole views.
+        chunk: Rays rendered at once. Fewer need less memory and give the same image.
         progress: Called after each chunk.
 
     Returns:
-        Radiance of shape `[h, w]` on the CPU, with what the coarse field sees left out.
+        Radiance of shape `[h, w]` on the CPU, without that of the coarse stage.
     """
     pixels = camera.width * camera.height
     if isinstance(render, ViewRenderer):

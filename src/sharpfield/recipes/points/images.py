@@ -20,7 +20,7 @@ from sharpfield.core.frames import DepthMaps
 from sharpfield.core.rays import Rays
 from sharpfield.fields.image_features import MAPS, FeatureExtractor, Merging, Mixing
 from sharpfield.ops.pyramid import look_up
-from sharpfield.rendering.points import Asked
+from sharpfield.rendering.points import ShadedSamples
 
 MIN_DEPTH = 1e-6
 """Least depth of a sample in a source image."""
@@ -279,7 +279,7 @@ class ImageBranch(nn.Module):
         return Prepared(frames, source, levels, alone)
 
     def forward(
-        self, feature: Float[Tensor, "n r"], asked: Asked, ready: Prepared
+        self, feature: Float[Tensor, "n r"], asked: ShadedSamples, ready: Prepared
     ) -> tuple[Float[Tensor, "n r"], Float[Tensor, "n c"], Float[Tensor, "n 1"]]:
         """Fuse the features of points with those of the source images.
 

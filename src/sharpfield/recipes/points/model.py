@@ -30,7 +30,7 @@ from sharpfield.losses.regularizers import indecision
 from sharpfield.recipes.points.growth import grown, missing_points
 from sharpfield.recipes.points.images import ImageBranch, Prepared
 from sharpfield.recipes.points.scene import PointScene
-from sharpfield.rendering.points import Asked, Met
+from sharpfield.rendering.points import PointRadiance, ShadedSamples
 from sharpfield.sampling.patches import PatchShape, draw_patches
 from sharpfield.sampling.pixels_and_pairs import pixel_table
 
@@ -137,7 +137,7 @@ class PointModel(nn.Module):
         terms = {"frames": error.sum() / met.hit.sum().clamp_min(1)}
         return terms | self._decided(met)
 
-    def colour(self, asked: Asked, ready: Prepared | None) -> Float[Tensor, "n c"]:
+    def colour(self, asked: ShadedSamples, ready: Prepared | None) -> Float[Tensor, "n c"]:
         """Colour of samples on rays, as frames store it."""
         field, start = self.scene.field, None
         if self.recipe.residual_colours:
@@ -187,7 +187,7 @@ class PointModel(nn.Module):
                 groups.append(Group(name, own, networks))
         return groups
 
-    def _blurred(self, colour: Float[Tensor, "b c"], seen: Pixels, met: Met) -> Tensor:
+    def _blurred(self, colour: Float[Tensor, "b c"], seen: Pixels, met: PointRadiance) -> Tensor:
         """Rendered patches, blurred as the recorded ones."""
         assert self.blur is not None
         patches = colour.view(*seen.value.shape)
@@ -198,7 +198,7 @@ class PointModel(nn.Module):
         blurred = self.blur(light, self.tone.decode(seen.value), known)
         return self.tone.encode(blurred.clamp_min(0)).view(colour.shape)
 
-    def _decided(self, met: Met) -> Terms:
+    def _decided(self, met: PointRadiance) -> Terms:
         """The confidence regulariser of the points that rays hit (Point-NeRF, section 4.3)."""
         if self.recipe.confidence_weight == 0:
             return {}

@@ -14,7 +14,7 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.points.cloud import NeuralPoints
 from sharpfield.fields.points.networks import PointField, PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions, starting_cloud
-from sharpfield.rendering.points import Colour, Met, PointMarch
+from sharpfield.rendering.points import Colour, PointMarch, PointRadiance
 
 VOXEL_OF_SPACING = 0.8
 """Edge of a voxel over the distance between points: 8 mm for the points of a ninehundredth."""
@@ -114,7 +114,7 @@ class PointScene(nn.Module):
         *,
         frame: Int64[Tensor, "b"] | None = None,
         step: int | None = None,
-    ) -> Met:
+    ) -> PointRadiance:
         """Render rays.
 
         Args:

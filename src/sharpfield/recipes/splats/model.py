@@ -27,7 +27,7 @@ from sharpfield.events.counts import subtract_row_delay
 from sharpfield.fields.gaussians.dynamic import MovingGaussians
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.formation.exposure import EventWindow, ExposureOfViews
-from sharpfield.geometry.normalise import centred, normalised
+from sharpfield.geometry.normalise import normalised, recentred
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.initialisation.moving import moving_gaussians
 from sharpfield.initialisation.static_points import backdrop_points, static_points
@@ -76,7 +76,7 @@ class SplatModel(nn.Module):
         super().__init__()
         self.steps, self.seed, self.sampling = steps, seed, sampling
         # A hull of what moves needs a box around the scene; a static one keeps its near depth.
-        self.capture, self.change = normalised(capture) if motion is None else centred(capture)
+        self.capture, self.change = normalised(capture) if motion is None else recentred(capture)
         if _motion_unknown(capture) and sampling.blur == "motion":
             self.capture = with_learned_exposure_motion(self.capture, seed)
         else:

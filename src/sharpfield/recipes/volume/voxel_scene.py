@@ -15,7 +15,7 @@ from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.events.index import EventIndex
 from sharpfield.fields.voxels import VoxelField, VoxelSizes, moving_shapes, static_shapes
-from sharpfield.geometry.normalise import centred
+from sharpfield.geometry.normalise import recentred
 from sharpfield.initialisation.visual_hull import visual_hull
 from sharpfield.ops.voxel_march import DENSITY_SHIFT
 from sharpfield.rendering.voxels import BoxSteps
@@ -63,7 +63,7 @@ class MovingScene(nn.Module):
     ) -> None:
         super().__init__()
         self.options, self.seed = options, seed
-        self.capture, self.change = centred(capture)
+        self.capture, self.change = recentred(capture)
         self.path = self.capture.trajectory
         hulls, shapes = None, moving_shapes(options.size)
         if options.hull and index is not None:
