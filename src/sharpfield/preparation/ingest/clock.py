@@ -29,7 +29,7 @@ MIN_SIGMAS = 3.0
 MAX_PAIRS = 3000
 """Frame pairs used; of longer recordings, those in the middle."""
 STEPS = 4
-"""Offsets offsets_ms per frame interval in the coarse search."""
+"""Offsets tried per frame interval in the coarse search."""
 
 Stamp = Literal["open", "middle", "close"]
 """Meaning of the single time of a frame."""

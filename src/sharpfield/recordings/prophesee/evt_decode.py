@@ -1,8 +1,14 @@
 """Decoders of Prophesee's event encodings EVT2, EVT2.1 and EVT3, in compiled loops over words.
 
-    EVT2    32-bit words: one event, or the high part of the time, or a trigger edge
-    EVT2.1  64-bit words: up to 32 neighbours of one row, or as above
-    EVT3    16-bit words: each changes one thing (row, low or high time) or reports events
+    EVT2    32-bit words, type in bits 28-31: 0 event, darker · 1 event, brighter · 8 counter, bits
+            0-27 · 10 trigger edge, channel in 8-12, edge in 0. Events and edges have the low time
+            in 22-27, events x in 11-21 and y in 0-10
+    EVT2.1  64-bit words: the upper half as in EVT2; an event word holds up to 32 events of one row,
+            x of the first pixel and one bit per pixel in the lower half
+    EVT3    16-bit words, type in bits 12-15: 0 row in 0-10 · 1 row of exposure measurements
+            · 2 event, x in 0-10, polarity in 11 · 3 x and polarity of the next vector · 4, 5 vector,
+            one bit for each of the next 12, 8 pixels · 6 low time, 12 bits · 8 counter, 12 bits
+            · 10 trigger edge, channel in 8-11, edge in 0
 
 Vocabulary: the *counter* is the high part of the time as a word holds it, which wraps; `HIGH` is
 the same unwrapped. Times are in us: the counter counts 64 us (EVT2, EVT2.1) or 4096 us (EVT3).
