@@ -6,7 +6,7 @@
     EVT2.1  64-bit words: the upper half as in EVT2; an event word holds up to 32 events of one row,
             x of the first pixel and one bit per pixel in the lower half
     EVT3    16-bit words, type in bits 12-15: 0 row in 0-10 · 1 row of exposure measurements
-            · 2 event, x in 0-10, polarity in 11 · 3 x and polarity of the next vector · 4, 5 vector,
+            · 2 event, x in 0-10, polarity in 11 · 3 x, polarity of the next vector · 4, 5 vector,
             one bit for each of the next 12, 8 pixels · 6 low time, 12 bits · 8 counter, 12 bits
             · 10 trigger edge, channel in 8-11, edge in 0
 
