@@ -1,10 +1,9 @@
-"""From blurry frames and events to a sharp scene.
+"""Inside `sf.train`: a recipe, its model, the training loop, a rendered view.
 
     python examples/01_a_sharp_scene.py
 
-records a scene with a shaky camera, learns it for some seconds, and writes `a_sharp_scene.png`: a
-blurry frame, the learned scene from the same place, and what was really there. The same from the
-command line, with a report: `sharpfield simulate`, `sharpfield train`, `sharpfield evaluate`.
+records a scene with a shaky camera, trains on it for some seconds, and writes `a_sharp_scene.png`:
+a blurry frame, the learned view from the same pose, and the sharp truth.
 """
 
 from pathlib import Path
@@ -13,11 +12,11 @@ import numpy as np
 import torch
 import tyro
 
+import sharpfield as sf
 from sharpfield.metrics.image import psnr
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.rendering.view import render_view
 from sharpfield.report.colormaps import eight_bit
-from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.images import write_image
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
@@ -26,16 +25,16 @@ from sharpfield.training.optim import adam
 def main(
     size: tuple[int, int] = (96, 64), steps: int = 200, out: Path = Path("a_sharp_scene.png")
 ) -> None:
-    """Record, learn, look."""
-    capture = simulate("garden", "shaky", rig=Rig(size), timing=Timing(frames=10), seed=0)
+    """Record, train, render."""
+    capture = sf.simulate("garden", size=size, frames=10, motion="shaky", seed=0)
     frames = capture.needed_frames
 
-    # A recipe is a paper's numbers; presets shrink them to what this machine can take.
+    # A recipe holds the options of a paper; presets shrink them to what a CPU can do.
     recipe = prepared("ev-deblur-nerf", "physical,draft", capture=capture, device="cpu")
     model = recipe.lasting(steps).build(capture, seed=0)
     fit(model, adam(model), steps=range(steps))
 
-    # The model has its own capture: the same cameras in the space that it learned in.
+    # The model has a capture of its own: the same cameras in the space that it is trained in.
     frame = int(capture.split.train[4])
     middle = float(capture.frame_time[frame].mean())
     pose = model.capture.frame_pose(np.array([frame]))[0]

@@ -1,10 +1,9 @@
-"""Watch a scene with an event camera, and with a frame camera beside it.
+"""Record a scene with an event camera and a frame camera behind the same lens.
 
     python examples/03_make_events.py
 
 writes `events.png`: a blurry frame, the sharp image it should have been, and the events of
-its exposure (red: brighter, blue: darker). The same capture in one line is
-`sharpfield simulate --out my_capture`.
+its exposure (red: brighter, blue: darker).
 """
 
 import cv2
@@ -13,18 +12,18 @@ import numpy as np
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
-# What records: two sensors behind one lens. Thresholds differ a little from pixel to pixel, and a
-# pixel is blind for 100 us after an event.
+# Two sensors behind one lens. Thresholds differ a little from pixel to pixel, and a pixel is blind
+# for 100 us after an event.
 rig = Rig(size=(240, 160), event_sensor=EventSensor(threshold_sigma=0.02, refractory_us=100.0))
 
-# When: four exposures of 50 ms. None is held out as a sharp view.
+# Four exposures of 50 ms. None is held out as a sharp view.
 timing = Timing(frames=4, exposure_us=50_000, interval_us=56_000, test_every=0)
 
 capture = simulate("garden", "glide", rig=rig, timing=timing, seed=1)
 frames, events = capture.needed_frames, capture.needed_events
 print(f"{len(frames)} frames, {len(events):,} events in {capture.clock.span_us / 1000:.0f} ms")
 
-# Events are columns in the order of time; a window of them is a view.
+# Events are columns in the order of time; a window of them is a numpy view.
 chosen = 2
 during = events.window(int(frames.exposure.open_us[chosen]), int(frames.exposure.close_us[chosen]))
 change = np.zeros((events.height, events.width))

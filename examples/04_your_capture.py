@@ -12,11 +12,8 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+import sharpfield as sf
 from sharpfield import core
-from sharpfield.captures.native.layout import write
-from sharpfield.captures.summary import summary
-from sharpfield.core.capture import Known, Thresholds
-from sharpfield.geometry.trajectory import Stamped
 
 
 def main(size: tuple[int, int] = (64, 48), out: Path = Path("your_capture")) -> None:
@@ -42,17 +39,17 @@ def main(size: tuple[int, int] = (64, 48), out: Path = Path("your_capture")) -> 
     p = random.choice(np.array([-1, 1], np.int8), 5000)  # -1 darker, +1 brighter
     capture = core.Capture(
         camera=core.Camera(width, height, 60.0, 60.0, width / 2, height / 2),  # f and centre, px
-        trajectory=Stamped(times_us, poses, clock),
+        trajectory=sf.geometry.Stamped(times_us, poses, clock),
         clock=clock,
         near=0.5,  # metres: the nearest thing before any camera
         far=5.0,
         frames=frames,
         events=core.EventStream(x, y, t_us, p, width, height),
         split=core.Split(train=np.array([0, 1, 2]), test=np.array([3])),
-        known=Known(thresholds=Thresholds(negative=0.25, positive=0.25)),
+        known=core.Known(thresholds=core.Thresholds(negative=0.25, positive=0.25)),
     )
-    write(capture, out)
-    print(summary(out)["events"])
+    sf.write(capture, out)
+    print(sf.read(out))
     in_ns = replace(frames, exposure=core.Exposure(opened * 1000, opened * 1000))
     try:
         replace(capture, frames=in_ns)

@@ -2,8 +2,8 @@
 
     python examples/05_your_paper.py
 
-trains it for some seconds. Two lines in your own `pyproject.toml` make it a recipe of the command
-line, with checkpoints, evaluation, report and videos:
+trains it for some seconds. Two lines in your own `pyproject.toml` make it a recipe of `sf.train`
+and of the command line, with checkpoints, evaluation, report and videos:
 
     [project.entry-points."sharpfield.recipes"]
     mean-blur = "my_package.mean_blur:MeanBlur"
@@ -15,13 +15,13 @@ from typing import ClassVar
 import tyro
 from torch import Tensor, nn
 
+import sharpfield as sf
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch
 from sharpfield.core.paper import Paper
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.nerf import NeRF, draft
-from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.hooks import every
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
@@ -29,7 +29,7 @@ from sharpfield.training.optim import adam
 
 @dataclass(frozen=True)
 class MeanBlur:
-    """The numbers of the paper; the command line is made from them."""
+    """The options of the paper; they are flags of the command line, too."""
 
     paper: ClassVar[Paper] = Paper(key="you2027", title="Your paper", bibtex="")
     steps: int = 100
@@ -66,13 +66,13 @@ class Model(nn.Module):
 
 def main(size: tuple[int, int] = (60, 40), steps: int = 100) -> None:
     """Train it, and watch the loss."""
-    capture = simulate("garden", rig=Rig(size), timing=Timing(frames=6))
+    capture = sf.simulate("garden", size=size, frames=6)
     model = MeanBlur().lasting(steps).build(capture, seed=0)
 
-    def tell(step: int, _model: object, _optimizer: object, losses: dict[str, Tensor]) -> None:
+    def report(step: int, _model: object, _optimizer: object, losses: dict[str, Tensor]) -> None:
         print(f"step {step:4}  blur {losses['blur']:.4f}")
 
-    fit(model, adam(model), steps=range(steps), hooks=[every(25, tell)])
+    fit(model, adam(model), steps=range(steps), hooks=[every(25, report)])
 
 
 if __name__ == "__main__":

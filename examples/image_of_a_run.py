@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sharpfield.captures.read import read_capture
 from sharpfield.core.events import EventStream
 from sharpfield.runs.config import read_run_config
 from sharpfield.storage.images import read_image, write_image
@@ -34,7 +33,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
 
-    capture = read_capture(read_run_config(options.run).capture)
+    capture = read_run_config(options.run).read_capture(options.run)
     frames, events = capture.needed_frames, capture.needed_events
     opens, closes = frames.exposure.window(options.frame)
     rebuilt = options.run / "renders" / "train" / f"{frames.names[options.frame]}.png"
