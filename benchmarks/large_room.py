@@ -260,7 +260,7 @@ def changes(recipe: str, points: int) -> list[str]:
         return [f"gaussians.cap_max={points}", "gaussians.start=0.9", "gaussians.grow_every=4"]
     return [
         f"cloud.voxel={voxel(points):.5f}",
-        "cloud.budget=0",
+        "cloud.max_points=0",
         "growth.max_points=0",
         "growth.share=0.0001",
         "growth.every=0.5",

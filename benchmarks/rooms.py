@@ -44,8 +44,8 @@ class Contender:
 
 
 H = "h-only,draft"
-MORE, WIDER = "cloud.budget=200000", "sizes.channels=32"
-FEW, NOISY = "cloud.budget=10000", "cloud.noise=0.05"
+MORE, WIDER = "cloud.max_points=200000", "sizes.channels=32"
+FEW, NOISY = "cloud.max_points=10000", "cloud.noise=0.05"
 
 STUDIES = {
     "recipes": (

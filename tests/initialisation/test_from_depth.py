@@ -68,7 +68,7 @@ def test_points_lie_on_the_wall_in_the_colours_of_learned_frames():
 
 
 def test_of_neighbours_the_better_frame_is_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sharpfield.initialisation.from_depth.SEEN_FROM", 1)
+    monkeypatch.setattr("sharpfield.initialisation.from_depth.MAX_FRAMES", 1)
     start = points_on_surfaces(
         wall(),
         tone_of("gamma2.2"),

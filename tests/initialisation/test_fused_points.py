@@ -7,7 +7,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.frames import DepthMaps
-from sharpfield.initialisation.fused_points import as_points, fuse_points
+from sharpfield.initialisation.fused_points import fuse_points
 from tests.streams import HEIGHT, WIDTH
 
 PLANE = 3.0
@@ -53,9 +53,6 @@ def test_points_are_the_pixels_of_a_slow_loop(walled):
     assert len(cloud) == len(expected)
     nearest = np.linalg.norm(cloud.points[:, None] - expected, axis=-1).min(1)
     assert nearest.max() < 1e-5
-    drawn = as_points(one.depth, 4, pose)
-    assert np.isnan(drawn[0, 0]).all()
-    np.testing.assert_allclose(drawn[~np.isnan(drawn[..., 0])], expected, atol=1e-5)
 
 
 def test_large_voxels_count_the_frames_that_saw_them(walled):
@@ -65,7 +62,7 @@ def test_large_voxels_count_the_frames_that_saw_them(walled):
 
 def test_merging_again_and_again_changes_nothing(walled, monkeypatch):
     whole = fuse_points(walled, stride=1, voxel=0.05)
-    monkeypatch.setattr("sharpfield.initialisation.fused_points.PENDING", 10)
+    monkeypatch.setattr("sharpfield.initialisation.fused_points.MAX_PENDING", 10)
     often = fuse_points(walled, stride=1, voxel=0.05)
     np.testing.assert_array_equal(often.views, whole.views)
     np.testing.assert_allclose(often.points, whole.points, rtol=1e-6)
@@ -93,9 +90,9 @@ def test_weights_choose_whose_colours_count(walled):
 
 
 def test_depth_limits(walled):
-    with pytest.raises(CaptureError, match="the depth maps show no points"):
-        fuse_points(walled, farthest=1.0)
-    assert len(fuse_points(walled, nearest=1.0)) > 0
+    with pytest.raises(CaptureError, match="the depth maps hold no points"):
+        fuse_points(walled, max_depth=1.0)
+    assert len(fuse_points(walled, min_depth=1.0)) > 0
 
 
 def test_errors_say_what_is_missing(panning, walled):

@@ -73,4 +73,4 @@ def test_borders_belong_to_the_image(tiny):
     found = sharp_images(tiny, THRESHOLDS)
     xy = np.array([[0.0, 0.0], [15.9, 15.9], [16.0, 3.0], [-0.1, 3.0]])
     assert found.inside(xy).tolist() == [True, True, False, False]
-    np.testing.assert_array_equal(found.look(xy[:2], 0), found.light[0, [0, 15], [0, 15]])
+    np.testing.assert_array_equal(found.light_at(xy[:2], 0), found.light[0, [0, 15], [0, 15]])

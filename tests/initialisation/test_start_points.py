@@ -48,7 +48,7 @@ def test_points_have_the_colour_of_a_image_that_shows_them(held, started):
     for view in range(len(held)):
         xy, _ = held.project(started.points, view)
         inside = held.inside(xy)
-        off = np.abs(held.look(xy[inside], view) - started.colours[inside]).max(-1)
+        off = np.abs(held.light_at(xy[inside], view) - started.colours[inside]).max(-1)
         least[inside] = np.minimum(least[inside], off)
     assert (least < 1e-3).mean() > 0.9
 
@@ -75,7 +75,7 @@ def test_a_known_cloud_is_used(held):
     assert blind.mean() < 0.1
     for view in range(2, 3):
         xy, _ = held.project(known, view)
-        assert np.abs(held.look(xy, view) - started.colours[:28]).mean() < 0.05
+        assert np.abs(held.light_at(xy, view) - started.colours[:28]).mean() < 0.05
 
 
 def test_a_cloud_larger_than_the_budget_is_thinned(held):

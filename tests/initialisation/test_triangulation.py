@@ -35,7 +35,7 @@ def test_colours_are_those_of_the_images(cloud):
     held = images()
     xy, _ = held.project(cloud.points, 2)
     seen = cloud.seen[2]
-    shown = held.look(xy[seen], 2)
+    shown = held.light_at(xy[seen], 2)
     assert np.median(np.abs(shown - cloud.colours[seen])) < 0.05
 
 

@@ -36,7 +36,7 @@ SMALL: dict[str, Any] = dict(
     steps=STEPS,
     lr=2e-3,
     points_lr=5e-3,
-    cloud=CloudOptions(budget=1200, farthest=float("inf"), colours="fused"),
+    cloud=CloudOptions(max_points=1200, max_depth=float("inf"), colours="fused"),
     sizes=PointSizes(channels=4, width=16, feature=48, octaves=(1, 2, 2)),
     march=MarchOptions(voxel=0.0, steps=0, max_samples=8, thickness=1.0, background=0.0),
     growth=GrowthOptions(every=0.0),
@@ -168,7 +168,7 @@ PUBLISHED = {
 
 def test_networks_have_the_published_numbers_of_parameters():
     recipe = Hybrid(
-        cloud=CloudOptions(budget=100),
+        cloud=CloudOptions(max_points=100),
         march=SMALL["march"],
         sampling=replace(PATCHES, patch_size=2),
     )
@@ -179,9 +179,9 @@ def test_networks_have_the_published_numbers_of_parameters():
 
 
 def test_a_point_has_42_numbers():
-    model = Hybrid(cloud=CloudOptions(budget=100), sampling=PATCHES, march=SMALL["march"]).build(
-        box(), 0
-    )
+    model = Hybrid(
+        cloud=CloudOptions(max_points=100), sampling=PATCHES, march=SMALL["march"]
+    ).build(box(), 0)
     points = model.scene.field.points
     assert sum(rows[0].numel() for rows in points.points().values()) == 42
 

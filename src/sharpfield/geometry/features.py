@@ -10,6 +10,7 @@ retrieval" (CVPR 2012).
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
@@ -40,26 +41,26 @@ def sift_features(
         root: Square roots of the descriptors (RootSIFT), whose differences ask less of few large
             bins.
     """
+    sift = _detector(most, contrast)
+    found: list[Features] = []
+    for image in images:
+        points, raw = sift.detectAndCompute(np.ascontiguousarray(image), None)
+        xy = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
+        _, first = np.unique(xy, axis=0, return_index=True)  # one per position, not per orientation
+        descriptors = np.zeros((0, 128)) if raw is None else np.asarray(raw, np.float32)[first]
+        length = np.linalg.norm(descriptors, 1 if root else 2, axis=-1, keepdims=True)
+        descriptors = descriptors / np.maximum(length, 1e-9)
+        descriptors = np.sqrt(descriptors) if root else descriptors
+        found.append(Features(xy[first], descriptors.astype(np.float32)))
+    return found
+
+
+def _detector(most: int, contrast: float) -> Any:
     import cv2
 
-    sift = cv2.SIFT_create(  # pyright: ignore
+    return cv2.SIFT_create(  # pyright: ignore
         most, contrastThreshold=contrast, enable_precise_upscale=True
     )
-    found = []
-    for image in images:
-        points, descriptors = sift.detectAndCompute(np.ascontiguousarray(image), None)
-        xy = np.array([point.pt for point in points], np.float64).reshape(-1, 2) + 0.5
-        descriptors = np.zeros((0, 128), np.float32) if descriptors is None else descriptors
-        _, first = np.unique(xy, axis=0, return_index=True)  # one per position, not per orientation
-        if root:
-            descriptors = np.sqrt(
-                descriptors / np.maximum(descriptors.sum(-1, keepdims=True), 1e-9)
-            )
-        else:
-            length = np.linalg.norm(descriptors, axis=-1, keepdims=True)
-            descriptors = descriptors / np.maximum(length, 1e-9)
-        found.append(Features(xy[first], descriptors[first].astype(np.float32)))
-    return found
 
 
 def squared_differences(one: Features, other: Features) -> Float32[np.ndarray, "m k"]:

@@ -63,7 +63,7 @@ def match_pairs(
     import cv2
 
     cv2.setRNGSeed(seed)
-    found = []
+    found: list[PairMatches] = []
     for pair in pairs:
         one, two = (features[i] for i in pair)
         rows = mutual_matches(squared_differences(one, two))
@@ -136,5 +136,5 @@ def pairs_apart(poses: Float64[np.ndarray, "n 3 4"], *, most: int) -> list[tuple
 
 def _on_plane(camera: Camera, xy: Float64[np.ndarray, "m 2"]) -> Float64[np.ndarray, "m 3"]:
     """Directions with a z of one."""
-    ray = camera.direction(torch.from_numpy(np.ascontiguousarray(xy))).numpy()
+    ray = camera.direction(torch.tensor(xy)).numpy()
     return ray / ray[:, 2:]

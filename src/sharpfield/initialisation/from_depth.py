@@ -1,8 +1,4 @@
-"""What a depth camera adds to a recipe on Gaussians: where to start, and how far surfaces are.
-
-The depth camera stands where the frame camera stands, but may have other pixels; each pixel of a
-frame is given the depth of the depth camera's pixel that looks along the same ray, or none.
-"""
+"""Points to start from on the surfaces that a depth camera measured."""
 
 import numpy as np
 import torch
@@ -14,8 +10,8 @@ from sharpfield.core.tone import Tone
 from sharpfield.initialisation.start_points import StartPoints
 from sharpfield.sampling.measured_depth import MeasuredDepth
 
-SEEN_FROM = 48
-"""Frames whose pixels become first points; neighbours in a walk see the same."""
+MAX_FRAMES = 48
+"""Frames whose pixels become points; neighbours in a walk see the same."""
 
 
 def points_on_surfaces(
@@ -27,25 +23,25 @@ def points_on_surfaces(
     weights: Float[np.ndarray, "n"] | None = None,
     size: float = 0.7,
 ) -> StartPoints:
-    """Points that the depth camera measured, with the colours that frames show there.
+    """Points at measured depth, with the colours of the frames' pixels.
 
     Args:
         capture: With frames and depth.
         tone: Of the frames.
         count: How many points, if enough depth is known.
-        generator: On the CPU; decides which pixels are taken.
-        weights: Of each training frame, for its quality; of neighbours the best one is taken.
-        size: Of each point, relative to the distance of its neighbours if all of them filled
+        generator: On the CPU; chooses the pixels.
+        weights: Of each training frame, for its quality; the best of neighbouring frames is used.
+        size: Of each point, relative to the distance between neighbours if all of them covered
             the surfaces evenly.
     """
     depth = MeasuredDepth(capture.needed_depth, capture.camera)
-    chosen = _sharpest(capture.split.train, weights)
+    chosen = _best_frames(capture.split.train, weights)
     frames, camera = capture.needed_frames, capture.camera
     ray = camera.direction(camera.grid().double()).numpy()
     ray = ray / ray[..., 2:]
     poses = capture.frame_pose(chosen).detach().double().numpy()
     each = -(-count // len(chosen))
-    points, colours, away = [], [], []
+    points, colours, depths = [], [], []
     for frame, pose in zip(chosen, poses, strict=True):
         seen = depth.at(int(frame))
         row, column = np.nonzero(seen)
@@ -57,28 +53,28 @@ def points_on_surfaces(
         points.append(far[:, None] * ray[row, column] @ pose[:, :3].T + pose[:, 3])
         stored = torch.from_numpy(frames.images[frame][row, column].astype(np.float32))
         colours.append(tone.decode(stored / frames.white).numpy())
-        away.append(far)
-    xyz, far = np.concatenate(points)[:count], np.concatenate(away)[:count]
-    apart = _apart(xyz)
+        depths.append(far)
+    xyz, far = np.concatenate(points)[:count], np.concatenate(depths)[:count]
+    spacing = _spacing(xyz)
     return StartPoints(
         xyz.astype(np.float32),
         np.concatenate(colours)[:count].astype(np.float32),
-        (size * np.minimum(apart, 0.1 * far)).astype(np.float32),
+        (size * np.minimum(spacing, 0.1 * far)).astype(np.float32),
     )
 
 
-def _sharpest(
+def _best_frames(
     train: Int64[np.ndarray, "t"], weights: Float[np.ndarray, "t"] | None
 ) -> Int64[np.ndarray, "m"]:
-    """At most `SEEN_FROM` frames, spread over the capture, the best of their neighbourhood."""
-    groups = np.array_split(np.arange(len(train)), min(SEEN_FROM, len(train)))
+    """At most `MAX_FRAMES` frames, spread over the capture, the best of their neighbours."""
+    groups = np.array_split(np.arange(len(train)), min(MAX_FRAMES, len(train)))
     if weights is None:
         return train[[group[len(group) // 2] for group in groups]]
     return train[[group[np.argmax(weights[group])] for group in groups]]
 
 
-def _apart(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """About how far the neighbours of each point are: from points counted in cubes."""
+def _spacing(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Approximate distance between neighbours at each point, from counts in cubes."""
     edge = np.ptp(points, axis=0).max() / 64 + 1e-9
     cube = np.floor(points / edge).astype(np.int64)
     _, which, counts = np.unique(cube, axis=0, return_inverse=True, return_counts=True)

@@ -1,8 +1,7 @@
-"""A cloud of points from measured depth: one point for each small cube (*voxel*) that was seen.
+"""Depth fusion: a point cloud from the depth maps of many frames, one point for each voxel.
 
-Pixels of many frames fall into one voxel, and their means become its point: place, colour, normal.
-Only frames that are learned from count, unless told: the depth of a held-out frame is knowledge
-that a method should not have.
+The points of all pixels that fall into a voxel are averaged: position, colour, normal. Only
+training frames are fused by default: a method should not have the depth of held-out frames.
 
 Source: Hybrid Neural Rendering (CVPR 2023) starts from such points; its release fuses the depth of
 all frames, held-out ones included (`frames="all"`), in voxels of about 1 cm.
@@ -17,20 +16,19 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.core.frames import DepthMaps
 
-PENDING = 3_000_000
-"""Voxels of single frames that are gathered before they are merged; bounds memory. As many as are
-known already may be gathered, so that time grows with the frames and not with their square."""
+MAX_PENDING = 3_000_000
+"""Voxels of single frames that are collected before they are merged; bounds memory. As many as are
+merged already may be collected, so that time grows with the frames and not with their square."""
 
 BITS = 21
-"""Of each coordinate in the number of a voxel: 2 million voxels along each axis."""
+"""Bits of each coordinate in the key of a voxel: 2 million voxels along each axis."""
 
-STEEP = 0.1
-"""Where depth changes by more than this share between neighbours, there is an edge, no surface."""
+EDGE = 0.1
+"""Relative change of depth between neighbours from which on there is an edge and no surface."""
 
 Which = Literal["train", "all"]
-"""Whose depth to fuse: of frames that are learned from, or of held-out ones, too."""
+"""Whose depth to fuse: of training frames, or of held-out ones, too."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +39,9 @@ class FusedPoints:
     colours: Float32[np.ndarray, "p 3"]
     """As frames store them, 0...1; grey frames give three equal values."""
     normals: Float32[np.ndarray, "p 3"]
-    """Unit length, towards the cameras that saw the point; zero where only edges were seen."""
+    """Unit length, towards the cameras that saw the point; zero at edges."""
     views: Int64[np.ndarray, "p"]
-    """How many frames saw the voxel: the more, the surer the point."""
+    """How many frames saw the voxel."""
 
     def __len__(self) -> int:
         """Number of points."""
@@ -52,12 +50,12 @@ class FusedPoints:
 
 @dataclass(frozen=True)
 class _Sums:
-    """What fell into each voxel."""
+    """Sums over the pixels in each voxel."""
 
     keys: Int64[np.ndarray, "v"]
-    """Numbers of voxels, ascending."""
+    """Keys of voxels, ascending."""
     columns: Float64[np.ndarray, "11 v"]
-    """Summed place (3), weighted colour (3), normal (3), weight, count."""
+    """Summed position (3), weighted colour (3), normal (3), weight, count."""
 
     def __len__(self) -> int:
         """Number of voxels."""
@@ -65,8 +63,8 @@ class _Sums:
 
 
 @dataclass(frozen=True)
-class _Looking:
-    """Where the pixels of a depth map look, and which pixel of a frame shows the same."""
+class _DepthPixels:
+    """Rays of the pixels of a depth map, and the pixels of a frame on the same rays."""
 
     rays: Float32[np.ndarray, "h w 3"]
     """With a z of 1."""
@@ -82,28 +80,28 @@ def fuse_points(
     frames: Which = "train",
     stride: int = 2,
     voxel: float = 0.01,
-    nearest: float = 0.0,
-    farthest: float = np.inf,
+    min_depth: float = 0.0,
+    max_depth: float = np.inf,
     weight: Float64[np.ndarray, "n"] | None = None,
 ) -> FusedPoints:
-    """The points that the depth maps of a capture show.
+    """Fuse the depth maps of a capture.
 
     Args:
         capture: With frames and depth.
         frames: "train", or "all": as published, but it leaks the depth of held-out frames.
-        stride: Take every how many pixels of a map, along both axes.
+        stride: Use every how many pixels of a map, along both axes.
         voxel: Edge of a voxel, in world units.
-        nearest: Smaller depth is left out; published work takes 0.3 m.
-        farthest: Larger depth is left out; published work takes 8 m.
+        min_depth: Smaller depth is left out; published work has 0.3 m.
+        max_depth: Larger depth is left out; published work has 8 m.
         weight: How much each frame counts for the colours, e.g. its sharpness; of all frames.
 
     Raises:
-        CaptureError: There is no depth, or it shows nothing.
+        CaptureError: There is no depth, or none within the limits.
         OptionError: Stride or voxel is not positive.
     """
     if stride < 1 or not voxel > 0:
         raise OptionError("stride and voxel must be positive", got=f"{stride}, {voxel}")
-    depth, looking = capture.needed_depth, _looking(capture, stride)
+    depth, pixels = capture.needed_depth, _depth_pixels(capture, stride)
     chosen = capture.split.train if frames == "train" else np.arange(len(depth))
     poses = capture.frame_pose(chosen).detach().double().numpy()
     origin = poses[:, :, 3].mean(0) if len(poses) else np.zeros(3)
@@ -111,59 +109,44 @@ def fuse_points(
     for frame, pose in zip(chosen.tolist(), poses, strict=True):
         share = 1.0 if weight is None else float(weight[frame])
         measured = depth.at(frame)[::stride, ::stride]
-        valid = (measured > max(nearest, 0)) & (measured < farthest)
-        columns = _seen(capture, frame, looking, np.where(valid, measured, 0), pose, share)
-        keys = _voxels(columns[:3].T - origin, voxel, capture.name)
+        valid = (measured > max(min_depth, 0)) & (measured < max_depth)
+        columns = _seen(capture, frame, pixels, np.where(valid, measured, 0), pose, share)
+        keys = _voxel_keys(columns[:3].T - origin, voxel, capture.name)
         seen.append(_summed(keys, columns))
-        if sum(map(len, seen)) > max(PENDING, len(known)):
+        if sum(map(len, seen)) > max(MAX_PENDING, len(known)):
             known, seen = _merged([known, *seen]), []
     known = _merged([known, *seen])
     if not len(known):
         raise CaptureError(
-            "the depth maps show no points",
+            "the depth maps hold no points",
             where=capture.name,
-            got=f"{len(chosen)} frames, depth {nearest} to {farthest}",
+            got=f"{len(chosen)} frames, depth {min_depth} to {max_depth}",
         )
     return _points(known.columns)
 
 
-def as_points(
-    depth: DepthMaps, frame: int, pose: Float64[np.ndarray, "3 4"]
-) -> Float64[np.ndarray, "h w 3"]:
-    """Where in the world each pixel of a depth map is; NaN where it is unknown.
-
-    Args:
-        depth: The maps.
-        frame: Which of them.
-        pose: World-from-camera of that frame.
-    """
-    measured = depth.at(frame)
-    points = (depth.rays() * measured[..., None]) @ pose[:, :3].T + pose[:, 3]
-    return np.where(measured[..., None] > 0, points, np.nan)
-
-
-def _looking(capture: Capture, stride: int) -> _Looking:
-    """The same for all frames, since both cameras stand in one place."""
+def _depth_pixels(capture: Capture, stride: int) -> _DepthPixels:
+    """The same for all frames, since both cameras have the same centre."""
     rays = np.ascontiguousarray(capture.needed_depth.rays()[::stride, ::stride])
     xy = capture.camera.project(torch.from_numpy(rays.astype(np.float64))).numpy()
     column, row = np.moveaxis(np.floor(xy).astype(np.int64), -1, 0)
     width, height = capture.camera.size
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return _Looking(rays, row, column, inside)
+    return _DepthPixels(rays, row, column, inside)
 
 
 def _seen(
     capture: Capture,
     frame: int,
-    looking: _Looking,
+    pixels: _DepthPixels,
     depth: Float32[np.ndarray, "h w"],
     pose: Float64[np.ndarray, "3 4"],
     share: float,
 ) -> Float64[np.ndarray, "11 q"]:
-    """What each pixel of one frame saw: the columns of `_Sums`, of a single pixel each."""
-    frames, inside = capture.needed_frames, looking.rays * depth[..., None]
-    held = (depth > 0) & looking.inside
-    colour = np.asarray(frames.images[frame])[looking.row[held], looking.column[held]]
+    """The columns of `_Sums` for each pixel of one frame."""
+    frames, inside = capture.needed_frames, pixels.rays * depth[..., None]
+    held = (depth > 0) & pixels.inside
+    colour = np.asarray(frames.images[frame])[pixels.row[held], pixels.column[held]]
     columns = np.ones((11, len(colour)))
     columns[:3] = pose[:, :3] @ inside[held].T + pose[:, 3:]
     columns[3:6] = colour.T * (share / frames.white)
@@ -184,28 +167,30 @@ def _normals(
     near = depth[:-1, :-1]
     smooth = (near > 0) & (length > 0)
     for other in (depth[:-1, 1:], depth[1:, :-1]):
-        smooth &= (other > 0) & (np.abs(other - near) < STEEP * near)
+        smooth &= (other > 0) & (np.abs(other - near) < EDGE * near)
     unit = across / np.where(length > 0, length, 1)[..., None]
     away = (unit * here).sum(-1, keepdims=True) > 0
     normals[:-1, :-1] = np.where(smooth[..., None], np.where(away, -unit, unit), 0)
     return normals
 
 
-def _voxels(places: Float64[np.ndarray, "q 3"], voxel: float, where: str) -> Int64[np.ndarray, "q"]:
-    """One number for the voxel that each place is in."""
-    cell = np.floor(places / voxel).astype(np.int64) + (1 << (BITS - 1))
+def _voxel_keys(
+    points: Float64[np.ndarray, "q 3"], voxel: float, where: str
+) -> Int64[np.ndarray, "q"]:
+    """The key of the voxel that each point is in."""
+    cell = np.floor(points / voxel).astype(np.int64) + (1 << (BITS - 1))
     if len(cell) and (cell.min() < 0 or cell.max() >= 1 << BITS):
         raise CaptureError(
             "points are too far apart for voxels of this size",
             where=where,
-            got=f"{np.abs(places).max():.3g} from the cameras, voxel {voxel}",
-            do="give `farthest`, or a larger voxel",
+            got=f"{np.abs(points).max():.3g} from the cameras, voxel {voxel}",
+            do="give `max_depth`, or a larger voxel",
         )
     return (cell[:, 0] << 2 * BITS) | (cell[:, 1] << BITS) | cell[:, 2]
 
 
 def _summed(keys: Int64[np.ndarray, "q"], columns: Float64[np.ndarray, "11 q"]) -> _Sums:
-    """Means over the pixels of one frame in each voxel: together they count as one view."""
+    """Means over the pixels of one frame in each voxel; together they count as one view."""
     sums = _merged([_Sums(keys, columns)])
     return _Sums(sums.keys, sums.columns / sums.columns[10])
 

@@ -1,4 +1,4 @@
-"""Where neural points start: on the surfaces that depth maps, or a sparse cloud, tell of."""
+"""Where neural points start: on surfaces from depth maps, or near a sparse point cloud."""
 
 from dataclasses import asdict, dataclass
 from typing import Literal
@@ -18,39 +18,40 @@ from sharpfield.initialisation.start_points import starting_points
 from sharpfield.storage.disk_cache import cached_arrays
 
 PAIRS = 1 << 20
-"""Of points and cameras, looked at at once: few enough to stay close to the CPU."""
+"""Pairs of points and cameras compared at once; few enough for the CPU's cache."""
 
-FAR_OFF = 200.0
-"""World units that count as much as a right angle to the axis, when a camera is chosen."""
+DISTANCE_UNIT = 200.0
+"""Distance in world units that counts as much as a right angle to the optical axis, when a camera
+is chosen."""
 
-GUESSED = 20_000
-"""Points where neither depth nor a budget is known."""
+DEFAULT_POINTS = 20_000
+"""Number of points where there is no depth and none is asked for."""
 
-FEW = 4.0
+POINTS_PER_CUBE = 4.0
 """Mean number of points in occupied cubes two spacings wide."""
 
 HALVINGS = 16
-"""Of the interval in which the spacing is looked for: to a part in several thousand."""
+"""Of the interval in which the spacing is searched: to a part in several thousand."""
 
 
 @dataclass(frozen=True)
 class CloudOptions:
-    """The points, and where they come from."""
+    """How many points there are, and where they come from."""
 
-    budget: int = 0
-    """About how many of them; 0 for one in each voxel."""
+    max_points: int = 0
+    """Approximate maximum number; 0 takes one point in each voxel."""
     voxel: float = 0.0
-    """Edge of the voxels that depth is fused in, in world units; 0 takes a 900th of the scene."""
+    """Edge of the voxels of depth fusion, in world units; 0 takes a 900th of the scene."""
     frames: Literal["train", "all"] = "train"
     """Whose depth is fused. The released code takes all frames, held-out ones included."""
-    nearest: float = 0.3
+    min_depth: float = 0.3
     """Smaller depth is left out."""
-    farthest: float = 8.0
+    max_depth: float = 8.0
     """Larger depth is left out."""
     colours: Literal["camera", "fused"] = "camera"
-    """Of one camera, as published, or means over all that see a point."""
+    """Of one camera, as published, or the mean over all that see a point."""
     noise: float = 0.0
-    """Standard deviation of noise on the places, in world units; the paper studies 0.05."""
+    """Standard deviation of noise on the positions, in world units; the paper studies 0.05."""
 
 
 @dataclass(frozen=True)
@@ -81,24 +82,24 @@ def starting_cloud(
 
     Args:
         options: How many, and from where.
-        capture: With depth, points, or frames alone, whose depth is then guessed.
+        capture: With depth, a sparse cloud, or frames alone.
         seed: Of the run.
         weight: How much each frame counts for colours.
     """
     weights = None if weight is None else weight.tolist()
     about = {"options": asdict(options), "seed": seed, "weight": weights}
-    found = cached_arrays(capture, "points", about, lambda: _found(options, capture, seed, weight))
+    found = cached_arrays(capture, "points", about, lambda: _arrays(options, capture, seed, weight))
     return Cloud(found["positions"], found["colours"], found["directions"], float(found["spacing"]))
 
 
-def _found(
+def _arrays(
     options: CloudOptions, capture: Capture, seed: int, weight: Float[np.ndarray, "a"] | None
 ) -> dict[str, np.ndarray]:
-    """What `Cloud` holds."""
+    """The arrays of a `Cloud`."""
     if capture.depth is not None:
         positions, colours = _fused(options, capture, weight)
     else:
-        positions, colours = _guessed(options, capture, seed)
+        positions, colours = _from_images(options, capture, seed)
     if options.noise:
         made = generator(seed, 0, "noise on points")
         drawn = torch.randn(positions.shape, generator=made).numpy()
@@ -124,7 +125,7 @@ def typical_spacing(positions: Float32[np.ndarray, "n 3"]) -> float:
         cell = ((positions - low) / edge).astype(np.int64)
         number = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
         occupied = 1 + np.count_nonzero(np.diff(np.sort(number)))
-        crowded = len(positions) > FEW * occupied
+        crowded = len(positions) > POINTS_PER_CUBE * occupied
         small, large = (small, edge) if crowded else (edge, large)
     return (small * large) ** 0.5 / 2
 
@@ -132,32 +133,32 @@ def typical_spacing(positions: Float32[np.ndarray, "n 3"]) -> float:
 def first_cameras(
     capture: Capture, positions: Float[Tensor, "n 3"]
 ) -> tuple[Int64[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """The training frame that each point belongs to, and the direction in which it sees it.
+    """The training frame that each point belongs to, and the direction from it to the point.
 
-    The frame is near, and looks towards the point; whether something hides it is not asked.
+    The frame is near, and its optical axis points towards the point; occlusion is ignored.
 
     Source: the released code of Hybrid Neural Rendering.
     """
     train = torch.as_tensor(capture.split.train)
     pose = capture.frame_pose(capture.split.train).detach().float()
-    place, axis = pose[:, :, 3], pose[:, :, 2]
-    middle = place.mean(0)  # sums of squares lose less when they are small
-    square, own = (place - middle).square().sum(-1), ((place - middle) * axis).sum(-1)
+    centre, axis = pose[:, :, 3], pose[:, :, 2]
+    middle = centre.mean(0)  # sums of squares lose less when they are small
+    square, own = (centre - middle).square().sum(-1), ((centre - middle) * axis).sum(-1)
     best = []
     for part in (positions - middle).split(max(PAIRS // len(train), 1)):
-        away = torch.addmm(square, part, (place - middle).T, alpha=-2)
-        away = away.add_(part.square().sum(-1, keepdim=True)).clamp_min_(1e-12).sqrt_()
-        along = torch.addmm(own, part, axis.T, beta=-1).div_(away)
-        best.append(along.sub_(away.div_(FAR_OFF)).argmax(-1))
+        distance = torch.addmm(square, part, (centre - middle).T, alpha=-2)
+        distance = distance.add_(part.square().sum(-1, keepdim=True)).clamp_min_(1e-12).sqrt_()
+        along = torch.addmm(own, part, axis.T, beta=-1).div_(distance)
+        best.append(along.sub_(distance.div_(DISTANCE_UNIT)).argmax(-1))
     chosen = torch.cat(best)
-    way = positions - place[chosen]
+    way = positions - centre[chosen]
     return train[chosen], way / way.norm(dim=-1, keepdim=True).clamp_min(1e-6)
 
 
 def colours_seen(
     capture: Capture, positions: Float[Tensor, "n 3"], frame: Int64[Tensor, "n"]
 ) -> Float[Tensor, "n c"]:
-    """What one frame each shows where points are; 0 outside its image."""
+    """Stored values at the projections of points, each in one frame; 0 outside its image."""
     frames, camera = capture.needed_frames, capture.camera
     found = torch.zeros(len(positions), frames.channels)
     order = frame.argsort(stable=True)
@@ -179,7 +180,7 @@ def colours_seen(
 def _fused(
     options: CloudOptions, capture: Capture, weight: Float[np.ndarray, "a"] | None
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    voxel = options.voxel or _ninehundredth(options, capture)
+    voxel = options.voxel or _fine_voxel(options, capture)
 
     def fused(edge: float) -> tuple[np.ndarray, np.ndarray]:
         assert capture.depth is not None
@@ -188,42 +189,42 @@ def _fused(
             frames=options.frames,
             stride=1 if capture.depth.camera.width <= 320 else 2,
             voxel=edge,
-            nearest=options.nearest,
-            farthest=options.farthest,
+            min_depth=options.min_depth,
+            max_depth=options.max_depth,
             weight=weight,
         )
         return cloud.points, cloud.colours
 
     positions, colours = fused(voxel)
     for _ in range(3):  # points on surfaces grow with the square of how fine voxels are
-        if not options.budget or len(positions) <= 1.1 * options.budget:
+        if not options.max_points or len(positions) <= 1.1 * options.max_points:
             break
-        voxel *= (len(positions) / options.budget) ** 0.5
+        voxel *= (len(positions) / options.max_points) ** 0.5
         positions, colours = fused(voxel)
     return positions, colours
 
 
-def _ninehundredth(options: CloudOptions, capture: Capture) -> float:
-    """Of the edge of a cube a little larger than the scene."""
-    coarse = (options.farthest if np.isfinite(options.farthest) else capture.far) / 50
+def _fine_voxel(options: CloudOptions, capture: Capture) -> float:
+    """A 900th of the edge of a cube a little larger than the scene."""
+    coarse = (options.max_depth if np.isfinite(options.max_depth) else capture.far) / 50
     rough = fuse_points(
         capture,
         frames=options.frames,
         stride=8,
         voxel=coarse,
-        nearest=options.nearest,
-        farthest=options.farthest,
+        min_depth=options.min_depth,
+        max_depth=options.max_depth,
     )
     return 1.05 * float(np.ptp(rough.points, axis=0).max()) / 900
 
 
-def _guessed(
+def _from_images(
     options: CloudOptions, capture: Capture, seed: int
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n c"]]:
-    """Pixels drawn by chance, as deep as a sparse cloud around them."""
+    """Random pixels, at the depth of a sparse cloud around them."""
     tone = tone_of(capture.needed_frames.encoding)
     images = sharp_images(capture.without(events=True), FixedThresholds(1.0, 1.0))
-    count = options.budget or GUESSED
+    count = options.max_points or DEFAULT_POINTS
     made = generator(seed, 0, "cloud")
     start = starting_points(images, count, made, known=capture.points)
     return start.points, tone.encode(torch.from_numpy(start.colours)).clamp(0, 1).numpy()

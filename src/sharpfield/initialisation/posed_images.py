@@ -1,4 +1,4 @@
-"""Sharp images of a scene, and where each was taken from: what a sparse cloud is made from."""
+"""Sharp images with known poses: what a sparse point cloud is triangulated from."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.sampling.event_windows import with_events_of
 
-MOST_IMAGES = 200
-"""Full precision takes 4 bytes a value: these are 0.7 GB at 640x480."""
+MAX_IMAGES = 200
+"""In float32 these are 0.7 GB at 640x480."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +38,16 @@ class Images:
         return len(self.light)
 
     def directions(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m 3"]:
-        """Unit directions, in the world, seen by pixels of a image."""
+        """Unit directions, in the world, seen by pixels of an image."""
         ray = self.camera.direction(torch.from_numpy(xy.astype(np.float64))).numpy()
         return ray @ self.poses[view, :, :3].T
 
     def project(
         self, points: Float[np.ndarray, "m 3"], view: int
     ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
-        """Pixels of points in a image, and their depth along its axis.
+        """Pixels of points in an image, and their depth along its axis.
 
-        Points less than half as far as the nearest depth get the depth -1 and no pixel.
+        Points nearer than half the nearest depth get the depth -1 and no pixel.
         """
         pose = self.poses[view]
         seen = (points.astype(np.float64) - pose[:, 3]) @ pose[:, :3]
@@ -62,16 +62,16 @@ class Images:
         x, y = xy.T
         return (x >= 0) & (x < self.camera.width) & (y >= 0) & (y < self.camera.height)
 
-    def look(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m c"]:
-        """Light of the pixels of a image that hold some positions."""
+    def light_at(self, xy: Float[np.ndarray, "m 2"], view: int) -> Float[np.ndarray, "m c"]:
+        """Linear light of the pixels of an image at some positions."""
         x, y = np.minimum(xy.astype(np.int64), np.array(self.camera.size) - 1).T
         return self.light[view, y, x]
 
 
 def sharp_images(
-    capture: Capture, thresholds: FixedThresholds, *, most: int = MOST_IMAGES
+    capture: Capture, thresholds: FixedThresholds, *, most: int = MAX_IMAGES
 ) -> Images:
-    """The frames to learn from: deblurred to the middle of their exposure where events tell how.
+    """The training frames, deblurred to the middle of their exposure where there are events.
 
     Args:
         capture: With frames, in the space that the images are to have.

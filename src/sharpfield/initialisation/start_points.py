@@ -1,8 +1,8 @@
-"""Where Gaussians start: near the surfaces, as well as images with known poses can tell.
+"""Points to start Gaussians from, near the surfaces that images with known poses show.
 
-A sparse *cloud* comes with the capture or is triangulated from the images. What is left of the
-budget are pixels drawn by chance from the images and put at a depth like that of the cloud
-around them; a few of them, or all where there is no cloud, anywhere between near and far.
+A sparse point *cloud* comes with the capture or is triangulated from the images. Up to the number
+of points asked for, random pixels of the images are added, at the depth of the cloud around them;
+a few of them, or all where there is no cloud, at a random depth between near and far.
 """
 
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from torch import Generator
 from sharpfield.initialisation.posed_images import Images
 from sharpfield.initialisation.triangulation import Cloud, triangulate
 
-BLIND = 0.05
-"""Part of the drawn pixels whose depth is guessed even where there is a cloud."""
+RANDOM_DEPTH = 0.05
+"""Fraction of random pixels whose depth is random even where there is a cloud."""
 
 NEIGHBOURS = 4
 """Points of the cloud, as seen in the image, whose median gives the depth of a pixel."""
 
 SPREAD = 0.02
-"""Least spread of that depth, relative to its inverse; the neighbours' own comes on top."""
+"""Least relative spread of the inverse depth; that of the neighbours is added."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class StartPoints:
     colours: Float32[np.ndarray, "n c"]
     """Linear light."""
     sizes: Float32[np.ndarray, "n"]
-    """In world units, so that all together fill a image."""
+    """In world units, so that all together fill an image."""
 
 
 def starting_points(
@@ -49,15 +49,15 @@ def starting_points(
     Args:
         images: Sharp ones, at least one.
         count: How many points.
-        generator: On the CPU; decides which pixels are drawn.
+        generator: On the CPU; chooses random pixels.
         known: A sparse cloud, where there is one.
-        size: Of each point, relative to the distance of its neighbours in a image.
+        size: Of each point, relative to the distance of its neighbours in an image.
     """
-    cloud = triangulate(images) if known is None else _shown(images, known)
+    cloud = triangulate(images) if known is None else _visible_points(images, known)
     if len(cloud.points) > count:
         chosen = torch.randperm(len(cloud.points), generator=generator)[:count].numpy()
         cloud = cloud[chosen]
-    drawn, colours, depth = _drawn(images, cloud, count - len(cloud.points), generator)
+    drawn, colours, depth = _random_pixels(images, cloud, count - len(cloud.points), generator)
     points = np.concatenate([cloud.points, drawn])
     nearest = np.full(len(cloud.points), np.inf)
     shown = 0
@@ -76,23 +76,23 @@ def starting_points(
     )
 
 
-def _shown(images: Images, points: Float[np.ndarray, "m 3"]) -> Cloud:
-    """Known points that some image shows; where one hides another is not known."""
+def _visible_points(images: Images, points: Float[np.ndarray, "m 3"]) -> Cloud:
+    """Known points that project into some image; occlusion is not known."""
     seen = np.zeros((len(images), len(points)), bool)
     shown = np.full((*seen.shape, images.light.shape[-1]), np.nan)
     for view in range(len(images)):
         xy, depth = images.project(points, view)
         seen[view] = images.inside(xy) & (depth > 0)
-        shown[view, seen[view]] = images.look(xy[seen[view]], view)
+        shown[view, seen[view]] = images.light_at(xy[seen[view]], view)
     some = seen.any(0)
-    colours = np.nanmedian(shown[:, some], 0)  # most images do not show what hides a point
+    colours = np.nanmedian(shown[:, some], 0)  # in most images nothing occludes a point
     return Cloud(points[some], colours, seen[:, some], np.zeros(int(some.sum())))
 
 
-def _drawn(
+def _random_pixels(
     images: Images, cloud: Cloud, count: int, generator: Generator
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n c"], Float[np.ndarray, "n"]]:
-    """Pixels drawn by chance, as points with their colour and depth."""
+    """Random pixels, as points with their colour and depth."""
     chance = torch.rand(count, 5, generator=generator, dtype=torch.float64).numpy()
     normal = torch.randn(count, generator=generator, dtype=torch.float64).numpy()
     views = (chance[:, 0] * len(images)).astype(np.int64)
@@ -103,13 +103,13 @@ def _drawn(
     colours = np.zeros((count, images.light.shape[-1]))
     for view in range(len(images)):
         here = np.flatnonzero(views == view)
-        colours[here] = images.look(xy[here], view)
-        told = here[chance[here, 4] >= BLIND]
-        found = _told(images, cloud, view, xy[told])
+        colours[here] = images.light_at(xy[here], view)
+        near_cloud = here[chance[here, 4] >= RANDOM_DEPTH]
+        found = _cloud_depth(images, cloud, view, xy[near_cloud])
         if found is not None:
             middle, spread = found
-            guess = middle + (spread + SPREAD * middle) * normal[told]
-            inverse[told] = np.clip(guess, farthest, nearest)
+            guess = middle + (spread + SPREAD * middle) * normal[near_cloud]
+            inverse[near_cloud] = np.clip(guess, farthest, nearest)
         pose = images.poses[view]
         ray = images.directions(xy[here], view)
         along = 1 / (inverse[here] * np.maximum(ray @ pose[:, 2], 1e-3))
@@ -117,13 +117,13 @@ def _drawn(
     return points, colours, 1 / inverse
 
 
-def _told(
+def _cloud_depth(
     images: Images, cloud: Cloud, view: int, xy: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]] | None:
-    """Inverse depth at pixels of a image as the cloud tells, and its spread; None if it cannot.
+    """Inverse depth of the cloud at pixels of an image, and its spread; None without neighbours.
 
-    Points hidden in this image tell the wrong depth; if it shows too few for sure, all count
-    that project into it.
+    Occluded points have the wrong depth; only if an image shows too few for sure, all points that
+    project into it are used.
     """
     where, depth = images.project(cloud.points, view)
     usable = images.inside(where) & (depth > 0)

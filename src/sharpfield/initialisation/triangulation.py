@@ -173,7 +173,7 @@ def triangulate(images: Images) -> Cloud:
     colours = np.zeros((count, images.light.shape[-1]))
     for view in range(len(images)):
         here = seen[seen.view == view]
-        np.add.at(colours, here.track, images.look(here.xy, view))
+        np.add.at(colours, here.track, images.light_at(here.xy, view))
     colours /= observations[:, None]
     return Cloud(points, colours, shown, error)[good]
 

@@ -43,6 +43,9 @@ PAPER = Paper(
 
 
 RENAMED = {
+    "cloud.budget": "cloud.max_points",
+    "cloud.nearest": "cloud.min_depth",
+    "cloud.farthest": "cloud.max_depth",
     "rate": "lr",
     "points_rate": "points_lr",
     "decay": "lr_final",
@@ -94,7 +97,11 @@ def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, samp
         residual_colours=True,
         sampling=sampling,
         cloud=CloudOptions(
-            budget=points, colours="fused", nearest=0.0, farthest=float("inf"), frames="train"
+            max_points=points,
+            colours="fused",
+            min_depth=0.0,
+            max_depth=float("inf"),
+            frames="train",
         ),
         sizes=PointSizes(
             channels=16,

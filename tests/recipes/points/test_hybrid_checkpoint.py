@@ -59,7 +59,7 @@ def released() -> dict[str, Tensor]:
 def published(path: Path) -> Hybrid:
     return Hybrid(
         sampling=PatchSamplingOptions(patches=2, patch_size=8, border=0, spacing=(1, 1)),
-        cloud=CloudOptions(budget=200),
+        cloud=CloudOptions(max_points=200),
         blur=BlurOptions(kind="learned"),
         frame_quality="even",
         checkpoint=str(path),
