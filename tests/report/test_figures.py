@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -76,3 +79,15 @@ def test_no_log_no_curves(tmp_path: Path):
     assert curves_figure(tmp_path / "log.csv") is None
     (tmp_path / "log.csv").write_text("step,seconds,total\n")
     assert curves_figure(tmp_path / "log.csv") is None
+
+
+def test_heavy_libraries_are_imported_when_they_are_used():
+    program = (
+        "import sys; from sharpfield.evaluation import report; from sharpfield.preparation import"
+        " quality; from sharpfield.preparation.doctor import page;"
+        " print(sorted({'matplotlib', 'av', 'jinja2'} & set(sys.modules)))"
+    )
+    words, source = [sys.executable, "-c", program], Path(__file__).parents[2] / "src"
+    there = os.environ | {"PYTHONPATH": str(source)}
+    found = subprocess.run(words, capture_output=True, text=True, check=True, env=there)
+    assert found.stdout.strip() == "[]"

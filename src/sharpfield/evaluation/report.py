@@ -55,10 +55,11 @@ class RunDescription:
     """What the page states besides the capture and the metrics."""
 
     title: str
+    """Heading of the page."""
     paper: Paper | None = None
-    """Of the recipe: its departures, and how to cite it."""
+    """Paper of the recipe: departures, and how to cite it."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Everything that was chosen, nested as it comes; shown as a table."""
+    """Settings of the run, nested; shown as a table with dotted names."""
 
 
 def write_report(
@@ -249,7 +250,7 @@ def _training(metrics: Mapping[str, Any]) -> dict[str, object]:
         facts["time"] = _duration(float(cost["seconds"]))
         if cost["steps"]:
             each = 1000 * cost["seconds"] / cost["steps"]
-            facts["steps"] = f"{cost['steps']:,}, {each:.3g} ms each"
+            facts["steps"] = f"{cost['steps']:,}, {each:.{0 if each >= 100 else 1}f} ms each"
     if cost["peak_memory_mb"]:
         facts["peak memory"] = f"{cost['peak_memory_mb']:,.0f} MB"
     views = [*metrics["views"], *metrics["train_views"]["views"]]

@@ -128,7 +128,7 @@ def _expect_replaceable(path: Path) -> None:
     if path.is_dir() and {p for p in path.iterdir()} <= set(list_images(path)):
         return
     raise OptionError(
-        "will not replace a folder that holds other things than images",
+        "will not replace a folder that holds other files than images",
         where=path,
         do="choose another folder, or empty it",
     )

@@ -1,5 +1,5 @@
 // Above each group of views, a slider that compares any two images of one view.
-// Without this script the images stand side by side.
+// Without this script the images are side by side.
 "use strict";
 for (const group of document.querySelectorAll(".compare")) {
   const views = [...group.querySelectorAll(".view")];
