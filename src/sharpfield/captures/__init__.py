@@ -1,1 +1,1 @@
-"""From disk to captures, and from captures to what a training step looks at."""
+"""Captures on disk: layouts of data sets, our own layout, trajectories, writers and summaries."""

@@ -18,7 +18,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 
 PROBES = 8
-"""Pixels along each image axis whose depth stands for what a frame sees."""
+"""Number of probe pixels along each image axis, whose depth gives the visible points."""
 
 SHARE = 0.1
 """Minimum share of what a frame sees that must lie in a slab for its block to use the frame."""

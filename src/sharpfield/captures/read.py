@@ -99,7 +99,7 @@ def layout_of(folder: Path) -> str:
 
 
 def _with_options(capture: Capture, options: ReadOptions) -> Capture:
-    """The capture with what the user says instead of its layout."""
+    """The capture with the options that apply to every layout."""
     known = capture.known
     if options.encoding is not None:
         frames = replace(capture.needed_frames, encoding=options.encoding)

@@ -60,7 +60,7 @@ def capture_summary(capture: Capture) -> dict[str, Any]:
         about["test_events"] = stream_summary(capture.test_events)
     if capture.frames is not None:
         about["frames"] = _frames_summary(capture.frames)
-        if capture.known.motion == "unknown":  # then exposures say nothing about blur
+        if capture.known.motion == "unknown":  # exposures do not tell blurry from sharp
             about["frames"] |= {"blurry": None, "sharp": None}
         about["split"] = {
             "train": len(capture.split.train),
@@ -126,7 +126,7 @@ def file_summary(file: EventFile) -> dict[str, Any]:
         for i, name in enumerate(("x", "y")):
             largest[i] = max(largest[i], float(file.stored(name, first, last).max()))
     span = file.span_us() if file.unit is not None and len(file) else None
-    # Without a stated size the sensor is at least as large as the largest coordinates say.
+    # Without a stated resolution the largest coordinates are a lower bound.
     width, height = file.size or (max(int(x) + 1, 1) for x in largest)
     replace(file, size=(width, height), unit=file.unit or "us").check()  # in any unit
     about = {

@@ -42,7 +42,7 @@ class Known:
     """What is known about a capture besides the measurements themselves."""
 
     poses: Certainty = "known"
-    """Unknown: the trajectory is a placeholder, a camera that stands still."""
+    """Unknown: the trajectory is a placeholder, a static camera."""
     motion: Certainty = "known"
     """Motion of the camera during exposures. Unknown: each frame has a single pose and a made-up
     time, and may be blurred or sharp."""

@@ -1,1 +1,1 @@
-"""Columns of events on disk: what captures and recordings both read and write."""
+"""Files that captures and recordings both read and write: events, images, arrays, the disk cache."""

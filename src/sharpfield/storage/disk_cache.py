@@ -44,7 +44,7 @@ def cache_folder(source: Path) -> Path:
 def cache_key(sources: Iterable[Path], *parameters: Any) -> str:
     """A key of source files and of parameters, which are JSON values or arrays.
 
-    Files are named by their size and time of change; they are not read.
+    Files are identified by name, size and time of change; they are not read.
     """
     stats = [(path.name, path.stat()) for path in sources]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]

@@ -30,7 +30,7 @@ COLUMNS = ("x", "y", "t_us", "p", "track")
 """Columns of a stream; `track` only where there are several cameras."""
 
 ABOUT = "events.json"
-"""Marks the folder of a stream, and says what it was made from."""
+"""Marks the folder of a stream, and states what it was made from."""
 
 
 def read_events(
@@ -44,7 +44,7 @@ def read_events(
         in_memory: Maximum number of events that are loaded.
 
     Raises:
-        CaptureError: The events are unsound, see `core.events.checked`.
+        CaptureError: The events are invalid, see `core.events.checked`.
     """
     folder = _mapped_columns(file, between) if len(file) > in_memory else None
     if folder is not None:

@@ -5,8 +5,8 @@ decoded once, in parallel, into the disk cache and memory-mapped from there: a t
 few frames of thousands, and decoding them again each time would cost more than the step.
 
 Values come back as the file holds them: 8 or 16 bit, RGB or grey, no PNG gamma applied, not turned
-by EXIF (poses and intrinsics refer to the stored orientation). What the numbers mean in terms of
-light is for `Frames.encoding` to say.
+by EXIF (poses and intrinsics refer to the stored orientation). How values relate to
+light is stated by `Frames.encoding`.
 """
 
 import os

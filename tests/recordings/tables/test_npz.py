@@ -142,7 +142,7 @@ def test_the_unit_is_asked_for_with_what_each_would_mean(tmp_path):
     with pytest.raises(CaptureError, match="does not state the unit") as caught:
         open_npz(path, ReaderOptions(size=SIZE))
     assert "0.08" in str(caught.value) and "s if us" in str(caught.value)
-    with pytest.raises(CaptureError, match="size of its sensor"):
+    with pytest.raises(CaptureError, match="state its sensor resolution"):
         open_npz(path, ReaderOptions(unit="us"))
 
 

@@ -1,8 +1,8 @@
 """Posed photographs: images with one pose each; motion during the exposure is unknown.
 
-Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds.
-Exposures do not tell whether such photos are blurred by motion: `Known.motion` is "unknown", which
-makes recipes learn a blur kernel.
+Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds. The
+exposures do not show whether photos are blurred by motion: `Known.motion` is "unknown", which makes
+recipes learn a blur kernel.
 """
 
 import re
@@ -57,7 +57,7 @@ def photo_capture(
     known: Known = PHOTOS,
     notes: Mapping[str, Note] | None = None,
 ) -> Capture:
-    """A capture of photos that were taken one by one.
+    """A capture of single photos.
 
     Args:
         photos: The images.
@@ -128,11 +128,11 @@ def existing(
     found = np.array([path.is_file() for path in paths], bool)
     gone = np.flatnonzero(~found)
     if len(gone) and (missing != "skip" or not found.any()):
-        named = ", ".join(paths[i].name for i in gone[:3])
+        listed = ", ".join(paths[i].name for i in gone[:3])
         raise CaptureError(
             f"{len(gone)} of {len(paths)} images are missing",
             where=where,
-            got=f"no {named}{', ...' if len(gone) > 3 else ''} in {paths[gone[0]].parent}",
+            got=f"no {listed}{', ...' if len(gone) > 3 else ''} in {paths[gone[0]].parent}",
             do="complete the download, or set the option `missing` to skip",
         )
     return np.flatnonzero(found)

@@ -73,7 +73,7 @@ def rgbd_capture(
     Args:
         frames: The frames.
         split: The split for a number of frames, without those whose pose is unusable.
-        folder: Of the recording, which is named after it.
+        folder: Folder of the recording, which gives its name.
         source: The layout.
         points: Sparse scene points.
 

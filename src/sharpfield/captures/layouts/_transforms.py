@@ -95,8 +95,8 @@ def image_path(folder: Path, file_path: str) -> Path:
     path = folder / file_path
     if path.suffix.lower() in SUFFIXES:
         return path
-    named = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
-    return next((candidate for candidate in named if candidate.is_file()), named[0])
+    candidates = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), candidates[0])
 
 
 def frame_name(file_path: str) -> str:

@@ -44,7 +44,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     Args:
         folder: Holds what the module describes.
         options: `factor` of the images, by default the smallest there are, which is what the
-            papers train on; `hold_out`, by default as the marker file says.
+            papers train on; `hold_out`, by default that of the marker file.
 
     Raises:
         CaptureError: Something is missing, malformed, or inconsistent.

@@ -144,7 +144,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         folder: Holds what the module describes.
         options: `trust_pickle` opens pickled files. A pickle can name programs to run; only
             arrays of numbers are built from it, and anything else is refused. `threshold` is
-            what one event adds to the sums, where the smallest of them does not say.
+            what one event adds to the sums, where it is not the smallest of them.
 
     Raises:
         CaptureError: Something is missing, malformed, or inconsistent; or there are only pickled

@@ -73,8 +73,8 @@ COLOR_DAVIS = Variant("us", "linear", "last:5", 0.25, "trajectory")
 
 def recognise(folder: Path) -> bool:
     """Whether a folder has this layout: the files of a trajectory, or a pose table and events."""
-    named = [(folder / name).is_file() for name in ("poses_bounds.npy", "events.h5")]
-    return all(named) or any((folder / name).is_file() for name in TRAJECTORY)
+    found = [(folder / name).is_file() for name in ("poses_bounds.npy", "events.h5")]
+    return all(found) or any((folder / name).is_file() for name in TRAJECTORY)
 
 
 def variant_of(folder: Path) -> Variant:
@@ -155,7 +155,7 @@ def _trajectory(folder: Path) -> tuple[PosesBounds, Stamped]:
                 where=path,
                 got="poses of single frames only",
                 do="give a pose at least every few ms, over all exposures and events;"
-                " one pose per frame does not say how the camera moved between",
+                " one pose per frame does not define the motion in between",
             )
     table = read_poses_bounds(poses_file)
     times_us = whole_us(load_array(times_file), "us", times_file)

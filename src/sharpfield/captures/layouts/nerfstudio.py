@@ -104,12 +104,12 @@ def estimated_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]
 
 
 def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.ndarray, "m 3"] | None:
-    named = content.get("ply_file_path")
-    if named is None:
+    file = content.get("ply_file_path")
+    if file is None:
         return None
-    if not isinstance(named, str):
-        raise CaptureError("`ply_file_path` must be text", where=path, got=named)
-    ply = folder / named
+    if not isinstance(file, str):
+        raise CaptureError("`ply_file_path` must be text", where=path, got=file)
+    ply = folder / file
     points = columns(read_ply(ply), ("x", "y", "z"), where=ply).astype(np.float64)
     return points if len(points) else None
 

@@ -7,7 +7,7 @@
     background                              "white" if images were composited on white
     reference_poses                         "frames" (the default) or "trajectory"
 
-Captures that were written before this table existed say the same in `[notes]`.
+Captures that were written before this table existed state the same in `[notes]`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -84,7 +84,7 @@ def _choice(table: Table, name: str, allowed: Sequence[str], fallback: str | Non
 
 
 def known_from_notes(notes: Mapping[str, Note]) -> tuple[Known, dict[str, Note]]:
-    """What the notes of an older capture say, and the notes that remain remarks."""
+    """What the notes of an older capture state, and the notes that remain remarks."""
     left = dict(notes)
     values: dict[str, Any] = {}
     for name in CERTAINTIES:

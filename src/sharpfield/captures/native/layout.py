@@ -12,8 +12,8 @@ points.npy         sparse scene points, if any
 notes.npz          notes that are arrays, if any
 cache/             the disk cache, see `storage.disk_cache`; delete it when you like
 
-A capture that was just recorded has no poses yet. It is stored with a camera that stands still, and
-`poses = "unknown"` in its table `[known]` says that this is only a placeholder.
+A capture that was just recorded has no poses yet. It is stored with a static camera, and
+`poses = "unknown"` in its table `[known]` marks this trajectory as a placeholder.
 """
 
 from dataclasses import replace
@@ -140,8 +140,7 @@ def read(folder: Path) -> Capture:
     """Read a capture.
 
     Raises:
-        CaptureError: Something is missing or malformed, does not fit together, or nobody knows
-            the poses yet.
+        CaptureError: Something is missing, malformed, or inconsistent, or the poses are unknown.
     """
     return expect_poses(read_unposed(folder), folder)
 
@@ -243,9 +242,9 @@ def _expect_tracks(
 ) -> None:
     """Check that the tracks of frames and events have poses."""
     known = count_tracks(trajectory)
-    named = [] if frames is None else [frames.track]
-    named += [one.track for one in streams if one is not None and one.track is not None]
-    for track in named:
+    used = [] if frames is None else [frames.track]
+    used += [one.track for one in streams if one is not None and one.track is not None]
+    for track in used:
         if len(track) and not (0 <= track.min() and track.max() < known):
             raise CaptureError(
                 "a frame or an event belongs to a track without poses",

@@ -9,7 +9,7 @@ Times are int64 us and poses float64 `[3 4]`, world-from-camera, OpenCV axes. Th
 - `still`: array `poses`, one per track;
 - `bspline`: arrays `knots`, `twist`, spanning `start_us` to `end_us`;
 - `tracks`: `moving` describes the tracks 0, 1, ... of the kinds above, whose arrays begin with
-  `0_`, `1_`, ...; `poses` are the tracks that stand still.
+  `0_`, `1_`, ...; `poses` are the still tracks.
 """
 
 import dataclasses

@@ -98,8 +98,7 @@ def path_layout(path: Path) -> PathLayout:
     rows = [line for line in lines if line and not line.startswith("#")]
     first = rows[0] if rows else ""
     if "," in first:
-        named = any(cell.strip()[:1].isalpha() for cell in first.split(","))
-        if named:
+        if any(cell.strip()[:1].isalpha() for cell in first.split(",")):
             return "csv"
         if len(first.split(",")) >= EUROC_COLUMNS:
             return "euroc"

@@ -131,7 +131,7 @@ def _stamps(capture: Capture) -> Stamps:
         raise CaptureError(
             "this layout needs a moving camera, whose poses are known over time",
             where=capture.name,
-            got="a camera that stands still",
+            got="a static camera",
         )
     count = -(-(known[1] - known[0]) // STAMP_US)
     times_us = np.minimum(known[0] + np.arange(count + 1) * STAMP_US, known[1]).astype(np.int64)

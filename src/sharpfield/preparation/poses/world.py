@@ -1,7 +1,7 @@
 """World coordinates of found poses: images determine them only up to a similarity.
 
 By default the average camera is at the origin and looks along z, and the median depth of the points
-is one. Measured depth gives a metric scale. Known positions define the world instead.
+is one. Measured depth gives a metric scale. KnownPoses positions define the world instead.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class KnownPoses:
-    """Known poses at the instants of the images."""
+    """KnownPoses poses at the instants of the images."""
 
     poses: Float64[np.ndarray, "n 3 4"]
     """World-from-camera; NaN where unknown."""
