@@ -1,1 +1,1 @@
-"""Files that captures and recordings both read and write: events, images, arrays, the disk cache."""
+"""Files of captures and recordings alike: events, images, arrays, and the disk cache."""

@@ -214,7 +214,7 @@ class Trap:
 def test_even_trusted_files_run_nothing(rig: Capture, folder: Path, name: str) -> None:
     Trap.mark = folder / "harm"
     pickled(folder, name, [*raw(rig)[:1], Trap()])
-    with pytest.raises(CaptureError, match="which is no array"):
+    with pytest.raises(CaptureError, match="which builds no array"):
         read_capture(folder, ReadOptions(trust_pickle=True))
     assert not Trap.mark.exists()
     with (folder / name).open("rb") as file:  # the trap is real
