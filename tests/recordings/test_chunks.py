@@ -87,7 +87,7 @@ def test_most_events_outside_the_sensor_are_an_error() -> None:
 
 def test_sizes() -> None:
     assert resolve_size((3, 4), None, "a") == resolve_size(None, (3, 4), "a") == (3, 4)
-    with pytest.raises(CaptureError, match="does not say how large the sensor is"):
+    with pytest.raises(CaptureError, match="does not state its sensor resolution"):
         resolve_size(None, None, "a")
     with pytest.raises(CaptureError, match="no sensor has this size"):
         resolve_size((0, 4), None, "a")

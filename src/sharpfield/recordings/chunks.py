@@ -107,7 +107,7 @@ def resolve_size(
     size = stated or given
     if size is None:
         raise CaptureError(
-            "the file does not say how large the sensor is",
+            "the file does not state its sensor resolution",
             where=where,
             do="give width and height, e.g. size 346 260",
         )

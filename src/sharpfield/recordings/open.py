@@ -26,7 +26,7 @@ FORMATS = Registry(
         "nmnist": "sharpfield.recordings.tables.npz:NMNIST",
         "text": "sharpfield.recordings.tables.text:FORMAT",
         "rpg-folder": "sharpfield.recordings.tables.text:RPG_FOLDER",
-        "hdf5": "sharpfield.recordings.tables.hdf5:FORMAT",
+        "hdf5": "sharpfield.recordings.tables.columns:FORMAT",
         "npz": "sharpfield.recordings.tables.npz:NPZ",
         "npz-folder": "sharpfield.recordings.tables.npz:NPZ_FOLDER",
         "npy": "sharpfield.recordings.tables.npz:NPY",

@@ -180,7 +180,7 @@ def test_a_torn_record_is_counted(tmp_path: Path) -> None:
 
 def test_the_camera_is_asked_for(tmp_path: Path) -> None:
     path = recorded(tmp_path / "a.aedat", HEADER, [(0, 1)])
-    with pytest.raises(CaptureError, match="does not say how large the sensor is"):
+    with pytest.raises(CaptureError, match="does not state its sensor resolution"):
         open_aedat2(path)
     with pytest.raises(CaptureError) as refused:
         open_aedat2(path, ReaderOptions(size=(320, 240)))

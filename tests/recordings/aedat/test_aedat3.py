@@ -143,7 +143,7 @@ def test_one_of_several_sources_is_chosen(tmp_path: Path) -> None:
 def test_the_size_of_an_unknown_camera_is_asked_for(tmp_path: Path) -> None:
     header = HEADER.format(sources="#Source 1: Visualizer\r\n")
     path = recorded(tmp_path / "a.aedat", polarities(some_events(9, 50, 40)), header=header)
-    with pytest.raises(CaptureError, match="does not say how large the sensor is"):
+    with pytest.raises(CaptureError, match="does not state its sensor resolution"):
         open_aedat3(path)
     assert len(open_aedat3(path, ReaderOptions(size=(50, 40))).load()) == 9
 

@@ -264,7 +264,7 @@ def test_the_size_is_asked_for_where_the_file_does_not_say(tmp_path: Path) -> No
     path = container(
         tmp_path / "a.aedat4", stream(0, "EVTS", width="", height=""), [(0, event_packet(events))]
     )
-    with pytest.raises(CaptureError, match="does not say how large the sensor is"):
+    with pytest.raises(CaptureError, match="does not state its sensor resolution"):
         open_aedat4(path)
     expect_equal_events(open_aedat4(path, ReaderOptions(size=(WIDTH, HEIGHT))).load(), events)
     with pytest.raises(CaptureError, match="no sensor has this size"):

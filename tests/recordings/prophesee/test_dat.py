@@ -120,7 +120,7 @@ def test_damaged_files_end_cleanly(tmp_path: Path) -> None:
     [
         ("", 12, "no header"),
         (HEADER, 3, "type 3, 8 bytes"),
-        ("% Version 2\n", 12, "how large the sensor is"),
+        ("% Version 2\n", 12, "sensor resolution"),
     ],
 )
 def test_files_that_do_not_do(header: str, kind: int, message: str, tmp_path: Path) -> None:

@@ -393,7 +393,7 @@ def test_events_outside_the_sensor_are_dropped_and_counted(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("% evt 3.0\n% end\n", "does not say how large the sensor is"),
+        ("% evt 3.0\n% end\n", "does not state its sensor resolution"),
         ("% geometry 64x48\n", "does not say how its events are encoded"),
         ("hello", "no header"),
         ("% evt 4.0\n% geometry 64x48\n", "cannot be read here"),

@@ -6,7 +6,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.recording import ReaderOptions
-from sharpfield.recordings.tables.hdf5 import open_hdf5
+from sharpfield.recordings.tables.columns import open_hdf5
 from sharpfield.storage.event_writer import write_events
 from tests.recordings import fuzz
 from tests.streams import HEIGHT, WIDTH, random_events

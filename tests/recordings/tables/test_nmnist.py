@@ -66,7 +66,7 @@ def test_damaged_files_end_cleanly(tmp_path: Path) -> None:
 def test_what_is_missing_is_asked_for(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(random_records())
-    with pytest.raises(CaptureError, match="how large the sensor is"):
+    with pytest.raises(CaptureError, match="sensor resolution"):
         open_nmnist(path)
     path.write_bytes(b"abc")
     with pytest.raises(CaptureError, match="holds no event"):

@@ -170,7 +170,7 @@ def test_damaged_files_end_cleanly(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lines", "options", "message"),
     [
-        ("0.1 2 3 1\n", {}, "how large the sensor is"),
+        ("0.1 2 3 1\n", {}, "sensor resolution"),
         ("100 2 3 1\n", {"size": DAVIS}, "unit of its times\n.*\n.*the first is 100"),
         ("0.1 2 3 0\n0.1 2 3 -1\n", {"size": DAVIS}, "three values"),
         ("x y t p\n1 2 0.5 1\n", {"size": DAVIS, "columns": "txyp"}, "not those in the file"),

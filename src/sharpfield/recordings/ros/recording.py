@@ -35,7 +35,7 @@ from sharpfield.recordings.recording import (
     Recording,
     Triggers,
 )
-from sharpfield.recordings.ros.bag import Bag, FieldReader, Message
+from sharpfield.recordings.ros.bag import ROS1_LINE, Bag, FieldReader, Message, open_ros1_bag
 from sharpfield.recordings.ros.event_messages import (
     ARRAYS,
     COMPRESSED,
@@ -50,11 +50,10 @@ from sharpfield.recordings.ros.event_messages import (
     event_header,
     event_packet,
 )
-from sharpfield.recordings.ros.ros1 import FIRST_LINE, open_ros1_bag
 from sharpfield.recordings.ros.ros2 import MCAP_MAGIC, SQLITE_MAGIC, open_mcap, open_sqlite_bag
 
 OPENERS = {
-    FIRST_LINE: open_ros1_bag,
+    ROS1_LINE: open_ros1_bag,
     MCAP_MAGIC: open_mcap,
     SQLITE_MAGIC: open_sqlite_bag,
 }
