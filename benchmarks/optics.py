@@ -20,10 +20,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.sensors.frames import FrameSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def main() -> None:
         native.write(capture, source)
         recipe = prepared("ev-splat", "draft", capture=capture, device="cpu")
         started = RunConfig("ev-splat", recipe, str(source.resolve()), asked.seed)
-        options = Options(steps=asked.steps)
-        start(started, capture, run, options, device="cpu", console=Console())
+        options = TrainingOptions(steps=asked.steps)
+        train_run(started, capture, run, options, device="cpu", console=Console())
         mean = open_run(run, capture=None, device="cpu").evaluate(console=Console())["mean"]
         rows.append({"camera": name, "psnr": mean["psnr"], "ssim": mean["ssim"]})
         save("optics", rows, {"steps": str(asked.steps), "size": asked.size})

@@ -28,8 +28,8 @@ from sharpfield.evaluation.refine import aligned_poses, refine_poses
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
-from sharpfield.training.options import Options
+from sharpfield.runs.start import train_run
+from sharpfield.training.options import TrainingOptions
 
 REFINED = Refinement(steps=200, rate=5e-4, every=50)
 
@@ -52,8 +52,8 @@ def main() -> None:
         run = asked.out / name
         recipe = prepared(name, "draft", capture=native.read(folder), device="cpu")
         started = RunConfig(name, recipe, str(folder.resolve()), asked.seed)
-        options = Options(minutes=asked.minutes)
-        start(started, native.read(folder), run, options, device="cpu", console=Console())
+        options = TrainingOptions(minutes=asked.minutes)
+        train_run(started, native.read(folder), run, options, device="cpu", console=Console())
         rows.append(_row(name, run))
     show(rows)
     facts = {"scene": asked.scene.name, "minutes": asked.minutes, "shrink": asked.shrink}

@@ -22,11 +22,11 @@ from sharpfield.core.capture import Capture
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.cameras.rigs import ring
 from sharpfield.simulation.moving_capture import MOVING_RIG, simulate_moving
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 Size = tuple[int, int]
 
@@ -66,7 +66,7 @@ def round_of(name: str, minutes: float, capture: Path, run: Path, device: str) -
     race, console, seen = RACES[name], Console(), native.read(capture)
     recipe = prepared(name, "draft", capture=seen, device=device)
     started = RunConfig(name, recipe, str(capture.resolve()), 0, use=race.use)
-    start(started, seen, run, Options(minutes=minutes), device=device, console=console)
+    train_run(started, seen, run, TrainingOptions(minutes=minutes), device=device, console=console)
     mean = open_run(run, device=device).evaluate(console=console)["mean"]
     trained = json.loads((run / "training.json").read_text())
     return {

@@ -24,10 +24,10 @@ from sharpfield.core.frames import Exposure
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ def _compete(
         device=asked.device,
     )
     started = RunConfig(contender.recipe, recipe, str(source.resolve()), asked.seed)
-    options = Options(minutes=asked.minutes)
-    start(started, native.read(source), run, options, device=asked.device, console=console)
+    options = TrainingOptions(minutes=asked.minutes)
+    train_run(started, native.read(source), run, options, device=asked.device, console=console)
     opened = open_run(run, capture=None, device=asked.device)
     opened = replace(opened, capture=native.read(folders["stored"]))
     metrics = opened.evaluate(console=console)

@@ -27,10 +27,10 @@ from sharpfield.geometry.trajectory import Stamped
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 THRESHOLDS, GUESS = (0.23, 0.31), (0.25, 0.25)
 LATE_US = 2000
@@ -102,7 +102,7 @@ def main() -> None:
     asked = parser.parse_args()
     console = Console()
     thresholds = asked.thresholds[0], asked.thresholds[1]
-    options = Options(steps=asked.steps, minutes=None if asked.steps else asked.minutes)
+    options = TrainingOptions(steps=asked.steps, minutes=None if asked.steps else asked.minutes)
     truth = recorded(parse_size(asked.size), thresholds, asked.seed)
     capture = spoiled(truth, asked.seed + 1)
     native.write(truth, asked.out / "truth")
@@ -114,7 +114,7 @@ def main() -> None:
         recipe = prepared("ev-splat", preset, capture=capture, device="cpu")
         recipe = replace(recipe, calibration=replace(recipe.calibration, threshold=GUESS))
         started = RunConfig("ev-splat", recipe, str((asked.out / "capture").resolve()), asked.seed)
-        start(started, capture, run, options, device="cpu", console=console)
+        train_run(started, capture, run, options, device="cpu", console=console)
         opened = open_run(run, capture=None, device="cpu")
         metrics = opened.evaluate(console=console)
         rows.append({"poses": name, **_row(opened.model, metrics, truth, thresholds)})

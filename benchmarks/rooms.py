@@ -24,9 +24,9 @@ from sharpfield.recipes.settings.options import changed
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.runs.config import RunConfig
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.room_capture import ROOM_RIG, RoomTiming, simulate_room
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,12 @@ def _compete(
     recipe = prepared(name, contender.preset, capture=capture, device=asked.device)
     recipe = changed(recipe, contender.changes)
     started = RunConfig(name, recipe, str(source.resolve()), asked.seed)
-    options = Options(steps=asked.steps) if asked.steps else Options(minutes=asked.minutes)
-    start(started, capture, run, options, device=asked.device, console=console)
+    options = (
+        TrainingOptions(steps=asked.steps)
+        if asked.steps
+        else TrainingOptions(minutes=asked.minutes)
+    )
+    train_run(started, capture, run, options, device=asked.device, console=console)
     opened = open_run(run, device=asked.device)
     metrics = opened.evaluate(train_views=1, console=console)
     trained = json.loads((run / "training.json").read_text())

@@ -24,7 +24,7 @@ from sharpfield.recordings.recording import ReaderOptions, Recording
 from sharpfield.runs.captures import LayoutName, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.by_name import (
     RecordingOptions,
     RigOptions,
@@ -32,7 +32,7 @@ from sharpfield.simulation.by_name import (
     TimingOptions,
     simulate_named,
 )
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 __all__ = ["deblur", "open_recording", "open_run", "read", "simulate", "train", "write"]
 
@@ -312,7 +312,7 @@ def train(
         )
     recipe_named(recipe)  # before anything is read
     where = device_named(device)
-    length = Options(steps=steps, minutes=minutes, resume=resume, memory_gb=memory_gb)
+    length = TrainingOptions(steps=steps, minutes=minutes, resume=resume, memory_gb=memory_gb)
     in_memory = isinstance(capture, Capture)
     source = capture if in_memory else read_capture(capture)
     made = prepared(recipe, preset, capture=source, device=where)
@@ -324,4 +324,4 @@ def train(
         use,
         block=block,
     )
-    return start(config, source, Path(out), length, device=where)
+    return train_run(config, source, Path(out), length, device=where)

@@ -25,7 +25,7 @@ from sharpfield.rendering.view import render_view
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.session import train
 from tests.recipes.box import box
 from tests.training.toy import quiet
@@ -102,7 +102,7 @@ def test_resuming_equals_never_having_stopped(tmp_path: Path, monkeypatch: pytes
     recipe, stop_at = replace(RECIPES["all ours"](), growth=growth), 14
 
     def go(folder: str, *, resume: bool = False) -> bytes:
-        options = Options(checkpoint_every=5, resume=resume)
+        options = TrainingOptions(checkpoint_every=5, resume=resume)
         train(
             lambda steps: recipe.build(box(), 1),
             tmp_path / folder,

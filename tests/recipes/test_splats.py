@@ -30,7 +30,7 @@ from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.session import train
 from tests.recipes.moving import tiny_moving
 from tests.training.toy import quiet
@@ -356,7 +356,7 @@ def test_resuming_equals_never_having_stopped(
         return model
 
     def go(folder: str, build: Any, *, resume: bool = False) -> bytes:
-        options = Options(checkpoint_every=5, resume=resume)
+        options = TrainingOptions(checkpoint_every=5, resume=resume)
         train(build, tmp_path / folder, options, steps=STEPS, settings={}, console=quiet())
         return file_of(tmp_path / folder, "last").read_bytes()
 

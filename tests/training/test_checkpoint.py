@@ -9,7 +9,7 @@ from torch import nn
 
 from sharpfield.core.errors import RunError
 from sharpfield.training.checkpoint import (
-    Progress,
+    TrainingProgress,
     check_settings,
     file_of,
     load,
@@ -35,12 +35,12 @@ def trained():
 
 
 def save(run: Path, trained, step: int) -> None:
-    save_last(run, *trained, Progress(step, 20, settings=SETTINGS))
+    save_last(run, *trained, TrainingProgress(step, 20, settings=SETTINGS))
 
 
 def test_what_is_saved_comes_back(tmp_path: Path, trained):
     model, optimizer = trained
-    save_last(tmp_path, *trained, Progress(12, 20, 3, best=1 / 3, settings=SETTINGS))
+    save_last(tmp_path, *trained, TrainingProgress(12, 20, 3, best=1 / 3, settings=SETTINGS))
     saved = load(file_of(tmp_path, "last"))
     assert saved.progress.settings == {"recipe": "toy", "samples": [64, 128]}
     assert (saved.progress.step, saved.progress.planned_steps, saved.progress.micro_batches) == (
@@ -66,7 +66,7 @@ def test_what_is_saved_comes_back(tmp_path: Path, trained):
 def test_a_part_under_two_names_is_saved_once(tmp_path: Path):
     model = Toy(20)
     model.again = model.net
-    save_last(tmp_path, model, adam(model), Progress(0, 20, settings=SETTINGS))
+    save_last(tmp_path, model, adam(model), TrainingProgress(0, 20, settings=SETTINGS))
     saved = load(file_of(tmp_path, "last"))
     assert not any("again" in name for name in saved.tensors)
 
@@ -127,7 +127,7 @@ def test_the_one_before_is_kept(tmp_path: Path, trained):
 
 
 def test_the_best_holds_weights_alone(tmp_path: Path, trained):
-    save_best(tmp_path, trained[0], Progress(12, 20, best=3.5))
+    save_best(tmp_path, trained[0], TrainingProgress(12, 20, best=3.5))
     best = load(file_of(tmp_path, "best"))
     assert best.progress.best == 3.5
     assert all(name.startswith("model.") for name in best.tensors)

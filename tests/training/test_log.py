@@ -6,7 +6,7 @@ import torch
 from rich.console import Console
 
 from sharpfield.training import log as log_module
-from sharpfield.training.log import Log, LogLosses, Table
+from sharpfield.training.log import CsvTable, LogLosses, TrainingLog
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy, quiet
 
@@ -16,8 +16,8 @@ def rows(run: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def open_log(run: Path, *, begin: int = 0, end: int = 10, seconds: float = 0.0) -> Log:
-    return Log(run, begin=begin, end=end, seconds=seconds, console=quiet())
+def open_log(run: Path, *, begin: int = 0, end: int = 10, seconds: float = 0.0) -> TrainingLog:
+    return TrainingLog(run, begin=begin, end=end, seconds=seconds, console=quiet())
 
 
 def test_rows_come_back(tmp_path: Path):
@@ -56,7 +56,7 @@ def test_resuming_drops_what_was_lost(tmp_path: Path):
 
 
 def test_a_table_of_nothing_has_its_header(tmp_path: Path):
-    Table(tmp_path / "log.csv", keep_to=0)
+    CsvTable(tmp_path / "log.csv", keep_to=0)
     assert (tmp_path / "log.csv").read_text().strip() == "step,seconds,total"
 
 
@@ -88,7 +88,7 @@ def test_where_nobody_watches_lines_are_rare(tmp_path: Path, monkeypatch):
     now, model = 0.0, Toy(1)
     optimizer = adam(model)
     monkeypatch.setattr(log_module.time, "monotonic", lambda: now)
-    with Log(tmp_path, begin=0, end=100, seconds=0.0, console=console) as log:
+    with TrainingLog(tmp_path, begin=0, end=100, seconds=0.0, console=console) as log:
         hook = LogLosses(log, every=1)
         for step in range(100):
             now += 0.5

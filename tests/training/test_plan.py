@@ -2,15 +2,15 @@ import pytest
 import torch
 
 from sharpfield.core.errors import OptionError
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.plan import TIME_FRACTION, Plan, affordable_steps, make_plan
 from tests.training.toy import Toy
 
 
 def test_the_recipe_gives_the_length_unless_told_otherwise():
-    plan, model = make_plan(Toy, Options(), steps=30, seconds=float("inf"))
+    plan, model = make_plan(Toy, TrainingOptions(), steps=30, seconds=float("inf"))
     assert plan == Plan(30, 1) and model.steps == 30
-    plan, model = make_plan(Toy, Options(steps=12), steps=30, seconds=float("inf"))
+    plan, model = make_plan(Toy, TrainingOptions(steps=12), steps=30, seconds=float("inf"))
     assert plan == Plan(12, 1) and model.steps == 12
 
 
@@ -29,7 +29,7 @@ def test_the_schedule_is_made_for_the_steps_that_fit():
         built.append(Toy(steps, seconds_per_step=0.005))
         return built[-1]
 
-    plan, model = make_plan(build, Options(minutes=0.01), steps=10_000, seconds=0.6)
+    plan, model = make_plan(build, TrainingOptions(minutes=0.01), steps=10_000, seconds=0.6)
     assert [toy.steps for toy in built] == [10_000, plan.steps] and plan.steps < 120
     assert model is built[1]
     fresh = Toy(plan.steps)
@@ -42,7 +42,7 @@ def test_no_time_is_still_one_step():
 
 def test_a_small_budget_splits_the_batch():
     wide = lambda steps: Toy(steps, measurements=4096)  # noqa: E731
-    plan, _ = make_plan(wide, Options(memory_gb=0.0004), steps=5, seconds=0.0)
+    plan, _ = make_plan(wide, TrainingOptions(memory_gb=0.0004), steps=5, seconds=0.0)
     assert plan.micro_batches > 1 and 4096 % plan.micro_batches == 0
 
 
@@ -59,5 +59,5 @@ def test_a_small_budget_splits_the_batch():
 )
 def test_senseless_options_are_refused(options: dict, message: str):
     with pytest.raises(OptionError) as error:
-        Options(**options)
+        TrainingOptions(**options)
     assert message in str(error.value)

@@ -8,7 +8,7 @@ from sharpfield.core.errors import RunError
 from sharpfield.core.points import Growth, unchanged
 from sharpfield.core.protocols import Growing, PointSet
 from sharpfield.training.checkpoint import (
-    Progress,
+    TrainingProgress,
     file_of,
     load,
     restore,
@@ -17,7 +17,7 @@ from sharpfield.training.checkpoint import (
 )
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.point_growth import apply_growth, resize
 from sharpfield.training.session import train
 from tests.training.growing import Blobs, GrowingToy
@@ -152,7 +152,7 @@ def test_resuming_equals_never_having_stopped_also_for_points_that_grew(tmp_path
         if saved is not None:
             restore(load(file_of(tmp_path / saved, "last")), model, optimizer)
         fit(model, optimizer, steps=steps)
-        save_last(tmp_path / folder, model, optimizer, Progress(steps.stop, 20))
+        save_last(tmp_path / folder, model, optimizer, TrainingProgress(steps.stop, 20))
         return file_of(tmp_path / folder, "last").read_bytes()
 
     straight = run("straight", range(18))
@@ -163,7 +163,7 @@ def test_resuming_equals_never_having_stopped_also_for_points_that_grew(tmp_path
 
 def test_a_whole_run_resumes_alike(tmp_path: Path):
     def go(folder: str, build, *, resume: bool) -> None:
-        options = Options(checkpoint_every=5, resume=resume)
+        options = TrainingOptions(checkpoint_every=5, resume=resume)
         train(build, tmp_path / folder, options, steps=18, settings={}, console=quiet())
 
     class Dying(GrowingToy):
@@ -184,7 +184,7 @@ def test_weights_alone_bring_their_number_of_points(tmp_path: Path):
     model = GrowingToy(20)
     optimizer = adam(model)
     fit(model, optimizer, steps=range(12))
-    save_last(tmp_path, model, optimizer, Progress(12, 20))
+    save_last(tmp_path, model, optimizer, TrainingProgress(12, 20))
     other = GrowingToy(20)
     restore_weights(load(file_of(tmp_path, "last")), other)
     assert torch.equal(other.blobs.places, model.blobs.places) and len(other.blobs.places) == 9
@@ -192,7 +192,7 @@ def test_weights_alone_bring_their_number_of_points(tmp_path: Path):
 
 def test_another_models_checkpoint_is_still_refused(tmp_path: Path):
     model = Toy(20)
-    save_last(tmp_path, model, adam(model), Progress(0, 20))
+    save_last(tmp_path, model, adam(model), TrainingProgress(0, 20))
     with pytest.raises(RunError, match="belongs to another model"):
         restore_weights(load(file_of(tmp_path, "last")), GrowingToy(20))
 

@@ -17,7 +17,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.session import train
 
 
@@ -90,7 +90,7 @@ if __name__ == "__main__":
     train(
         lambda length: Toy(length, seconds_per_step=seconds),
         folder,
-        Options(resume="--resume" in sys.argv, checkpoint_every=1, log_every=5),
+        TrainingOptions(resume="--resume" in sys.argv, checkpoint_every=1, log_every=5),
         steps=steps,
         settings={"recipe": "toy", "seed": 0},
     )

@@ -14,7 +14,7 @@ from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.cli.train import TRAINING, Selection
 from sharpfield.core.errors import OptionError
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def blocks_command(
     out: Path,
     device: Device = "auto",
     selection: BlockSelection = SELECTION,
-    training: Options = TRAINING,
+    training: TrainingOptions = TRAINING,
     reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Selection:
     """Options of the recipe, as events.weight=0; better written --events.weight 0."""
 
 
-SELECTION, TRAINING = Selection(), Options()
+SELECTION, TRAINING = Selection(), TrainingOptions()
 
 
 def train_command(
@@ -41,7 +41,7 @@ def train_command(
     out: Path,
     device: Device = "auto",
     selection: Selection = SELECTION,
-    training: Options = TRAINING,
+    training: TrainingOptions = TRAINING,
     reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
@@ -61,7 +61,7 @@ def train_command(
     from sharpfield.recipes.settings.options import changed, with_options
     from sharpfield.recipes.settings.presets import prepared
     from sharpfield.runs.config import RunConfig, device_named
-    from sharpfield.runs.start import start
+    from sharpfield.runs.start import train_run
 
     hint_at_flags(recipe, selection.change)
     console, where = screen(), device_named(device)
@@ -72,6 +72,6 @@ def train_command(
     started = RunConfig(
         recipe, made, where_from, selection.seed, selection.use, reading, selection.block
     )
-    trained = start(started, source, out, training, device=where, console=console)
+    trained = train_run(started, source, out, training, device=where, console=console)
     if trained.status.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")

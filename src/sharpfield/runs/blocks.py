@@ -12,10 +12,10 @@ from sharpfield.core.capture import Capture
 from sharpfield.recipes.splats.merge import merge
 from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
-from sharpfield.training.checkpoint import Progress, check_settings, file_of, save_last
+from sharpfield.runs.start import train_run
+from sharpfield.training.checkpoint import TrainingProgress, check_settings, file_of, save_last
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.status import TrainingStatus, read_status, write_status
 
 FOLDER = "blocks"
@@ -45,7 +45,7 @@ class BlockRuns:
 def train_blocks(
     runs: BlockRuns,
     capture: Capture,
-    options: Options,
+    options: TrainingOptions,
     *,
     own: Iterable[int] | None = None,
     device: str,
@@ -77,7 +77,7 @@ def train_blocks(
             continue
         console.print(f"Block {block.block}")
         going_on = replace(options, resume=options.resume or done is not None)
-        start(block, capture, folders[i], going_on, device=device, console=console)
+        train_run(block, capture, folders[i], going_on, device=device, console=console)
     statuses = [status for folder in folders if (status := read_status(folder)) is not None]
     if len(statuses) < runs.count or not all(status.finished for status in statuses):
         return False
@@ -114,6 +114,6 @@ def _merge(runs: BlockRuns, capture: Capture, together: TrainingStatus) -> None:
     models = [open_run(run, device="cpu").model for run in runs.folders()]
     merged: Any = merge(models, blocks_of(capture, runs.count))
     write_run_config(runs.out, runs.whole)
-    progress = Progress(together.steps, together.steps, settings=runs.whole.settings())
+    progress = TrainingProgress(together.steps, together.steps, settings=runs.whole.settings())
     save_last(runs.out, merged, adam(merged), progress)
     write_status(runs.out, together)

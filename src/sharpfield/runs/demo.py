@@ -17,10 +17,10 @@ from sharpfield.recipes.settings.presets import prepared
 from sharpfield.report.tables import markdown
 from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run
-from sharpfield.runs.start import start
+from sharpfield.runs.start import train_run
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 STRONG_BLUR = Timing(exposure_us=80_000, interval_us=90_000)
 """Exposures in dim light."""
@@ -106,8 +106,8 @@ def _compete(
     capture = native.read(source)
     recipe = prepared(contender.recipe, "draft", capture=capture, device=where)
     started = RunConfig(contender.recipe, recipe, str(source.resolve()), seed, contender.use)
-    options = Options(minutes=minutes, validate_every=200)
-    start(started, capture, run, options, device=where, console=console)
+    options = TrainingOptions(minutes=minutes, validate_every=200)
+    train_run(started, capture, run, options, device=where, console=console)
     # All are measured against the same capture: blurry input, sharp truth.
     opened = open_run(run, capture=None, device=where)
     opened = replace(opened, capture=native.read(out / "capture"))

@@ -24,7 +24,7 @@ from sharpfield.twin.event_twin import (
 )
 from sharpfield.twin.options import RECORDED
 
-Path = tuple[Sequence[int], Sequence[Any]]
+TimedPoses = tuple[Sequence[int], Sequence[Any]]
 """Times in us on the capture's clock, and a pose at each."""
 
 
@@ -58,8 +58,8 @@ def whole_steps(span_us: tuple[int, int], last_us: int, time_steps: TimeSteps) -
     return start, min(start + steps * time_steps.step_us, last_us)
 
 
-def viewpoint(
-    model: Any, capture: Capture, path: int | Path, size: tuple[int, int] | None
+def event_viewpoint(
+    model: Any, capture: Capture, path: int | TimedPoses, size: tuple[int, int] | None
 ) -> Viewpoint:
     """An event camera on a track of the capture, or on a path of its own."""
     if isinstance(path, int):

@@ -28,10 +28,8 @@ from sharpfield.rendering.view import render_view, renderer_of
 from sharpfield.report.colormaps import eight_bit
 from sharpfield.report.video import write_video
 from sharpfield.runs.config import RunConfig, device_named, read_run_config, used
-from sharpfield.runs.events import Path as EventPath
-from sharpfield.runs.events import event_sensor, render_events
-from sharpfield.runs.events import viewpoint as event_viewpoint
-from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, viewpoint
+from sharpfield.runs.events import TimedPoses, event_sensor, event_viewpoint, render_events
+from sharpfield.runs.views import At, depth_along_axis, encoded, mean_light, view_spec
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.training.checkpoint import file_of, load, restore_weights
 from sharpfield.training.status import TrainingStatus, read_status
@@ -99,7 +97,7 @@ class Run:
             OptionError: There is no such frame, or the time is outside the capture.
             ShapeError: The pose has another shape, or is none.
         """
-        camera = viewpoint(self.model, self.capture, at, time)
+        camera = view_spec(self.model, self.capture, at, time)
         if exposure is not True:
             camera = replace(camera, exposure_us=float(exposure))
         light = mean_light(self.model, self.capture, camera, samples)
@@ -114,12 +112,12 @@ class Run:
             at: As for `render`.
             time: As for `render`.
         """
-        camera = viewpoint(self.model, self.capture, at, time)
+        camera = view_spec(self.model, self.capture, at, time)
         return depth_along_axis(self.model, self.capture, camera)
 
     def events(
         self,
-        path: int | EventPath = 0,
+        path: int | TimedPoses = 0,
         *,
         start: float | int | None = None,
         end: float | int | None = None,

@@ -11,15 +11,15 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
 from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
 from sharpfield.runs.run import Run
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.session import require_unused, train
 
 
-def start(
+def train_run(
     config: RunConfig,
     capture: Capture,
     folder: Path,
-    options: Options,
+    options: TrainingOptions,
     *,
     device: str,
     console: Console | None = None,

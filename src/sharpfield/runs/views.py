@@ -29,7 +29,7 @@ TINY_OPACITY = 1e-3
 
 
 @dataclass(frozen=True)
-class Viewpoint:
+class ViewSpec:
     """A camera that stands still at a pose, or that moves along a track."""
 
     time_us: float
@@ -42,7 +42,7 @@ class Viewpoint:
     """In the model's world; None to follow the track."""
 
 
-def viewpoint(model: Any, capture: Capture, at: Any, time: float | int | None) -> Viewpoint:
+def view_spec(model: Any, capture: Capture, at: Any, time: float | int | None) -> ViewSpec:
     """The camera that `at` and `time` ask for.
 
     Args:
@@ -66,7 +66,7 @@ def viewpoint(model: Any, capture: Capture, at: Any, time: float | int | None) -
         )
     when = clock.origin_us + clock.span_us / 2 if time is None else float(time)
     if at is None:
-        return Viewpoint(when)
+        return ViewSpec(when)
     if isinstance(at, int | np.integer) and not isinstance(at, bool):
         frames = capture.needed_frames
         if not 0 <= at < len(frames):
@@ -77,10 +77,10 @@ def viewpoint(model: Any, capture: Capture, at: Any, time: float | int | None) -
         own = float(exposure.middle_us[at])
         duration = float(exposure.duration_us[at])
         when = own if time is None else when
-        return Viewpoint(when, duration, int(frames.track[at]))
+        return ViewSpec(when, duration, int(frames.track[at]))
     pose = change_of(model.capture).poses(as_pose(at))
     held = torch.from_numpy(pose).float().to(device_of(model))
-    return Viewpoint(when, pose=held)
+    return ViewSpec(when, pose=held)
 
 
 def as_pose(values: Any) -> Float[np.ndarray, "3 4"]:
@@ -106,7 +106,7 @@ def as_pose(values: Any) -> Float[np.ndarray, "3 4"]:
     return pose[:3]
 
 
-def radiance(model: Any, capture: Capture, camera: Viewpoint) -> Radiance:
+def radiance(model: Any, capture: Capture, camera: ViewSpec) -> Radiance:
     """Sharp linear light of one instant, `[h, w]`, on the CPU.
 
     Raises:
@@ -128,7 +128,7 @@ def radiance(model: Any, capture: Capture, camera: Viewpoint) -> Radiance:
 
 
 def mean_light(
-    model: Any, capture: Capture, camera: Viewpoint, samples: int
+    model: Any, capture: Capture, camera: ViewSpec, samples: int
 ) -> Float[Tensor, "h w c"]:
     """Linear light gathered during an exposure: the mean of sharp views, evenly spread in time.
 
@@ -144,7 +144,7 @@ def mean_light(
     parts = (np.arange(count) + 0.5) / count - 0.5  # middles of equal parts, -0.5...0.5
     times = camera.time_us + camera.exposure_us * parts
     views = [
-        Viewpoint(time, track=camera.track, pose=camera.pose)  # each an instant
+        ViewSpec(time, track=camera.track, pose=camera.pose)  # each an instant
         for time in times.tolist()
     ]
     return torch.stack([radiance(model, capture, one).rgb for one in views]).mean(0)
@@ -157,7 +157,7 @@ def encoded(model: Any, light: Float[Tensor, "h w c"]) -> Float[np.ndarray, "h w
     return stored.expand(-1, -1, 3).contiguous().numpy()
 
 
-def depth_along_axis(model: Any, capture: Capture, camera: Viewpoint) -> Float[np.ndarray, "h w"]:
+def depth_along_axis(model: Any, capture: Capture, camera: ViewSpec) -> Float[np.ndarray, "h w"]:
     """Depth along the camera's axis, in units of the capture's world."""
     seen, own = radiance(model, capture, camera), model.capture
     depth = seen.depth

@@ -41,7 +41,7 @@ START_AGAIN = "train again without --resume, into another folder"
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingProgress:
     """How far a run is."""
 
     step: int
@@ -60,7 +60,7 @@ class Progress:
 class Checkpoint:
     """A checkpoint as read, on the CPU."""
 
-    progress: Progress
+    progress: TrainingProgress
     tensors: dict[str, Tensor]
 
 
@@ -69,7 +69,7 @@ def file_of(run: Path, name: str) -> Path:
     return run / "checkpoints" / f"{name}{SUFFIX}"
 
 
-def save_last(run: Path, model: Model, optimizer: Optimizer, progress: Progress) -> None:
+def save_last(run: Path, model: Model, optimizer: Optimizer, progress: TrainingProgress) -> None:
     """Save everything needed to resume; the checkpoint before is kept as `previous`.
 
     Raises:
@@ -83,7 +83,7 @@ def save_last(run: Path, model: Model, optimizer: Optimizer, progress: Progress)
             last.replace(file_of(run, "previous"))
 
 
-def save_best(run: Path, model: Model, progress: Progress) -> None:
+def save_best(run: Path, model: Model, progress: TrainingProgress) -> None:
     """Save the weights alone."""
     with replacing(file_of(run, "best")) as temporary:
         _write(temporary, _model_tensors(model), progress)
@@ -218,11 +218,11 @@ def _dotted(nested: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return found
 
 
-def _unpacked(header: str | None, path: Path) -> tuple[str, Progress]:
+def _unpacked(header: str | None, path: Path) -> tuple[str, TrainingProgress]:
     """Checksum and progress of a file's header."""
     try:
         written = json.loads(header or "")
-        return written["checksum"], Progress(**written["progress"])
+        return written["checksum"], TrainingProgress(**written["progress"])
     except (ValueError, TypeError, KeyError):
         raise RunError(
             "not a checkpoint of sharpfield, or one of another version",
@@ -231,7 +231,7 @@ def _unpacked(header: str | None, path: Path) -> tuple[str, Progress]:
         ) from None
 
 
-def _write(path: Path, tensors: dict[str, Tensor], progress: Progress) -> None:
+def _write(path: Path, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
     ill = [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]
     if ill:
         raise RunError(

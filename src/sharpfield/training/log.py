@@ -30,7 +30,7 @@ LINE_SECONDS = 10.0
 FIRST_COLUMNS = ["step", "seconds", "total"]
 
 
-class Table:
+class CsvTable:
     """A CSV file that grows by rows, and by columns when a new name appears."""
 
     def __init__(self, path: Path, *, keep_to: int) -> None:
@@ -63,7 +63,7 @@ class Table:
             writer.writerows(rows)
 
 
-class Log:
+class TrainingLog:
     """Records losses and scores, and shows progress."""
 
     def __init__(
@@ -78,7 +78,7 @@ class Log:
             seconds: Training time of earlier sessions.
             console: Where progress is shown.
         """
-        self.table = Table(run / "log.csv", keep_to=begin)
+        self.table = CsvTable(run / "log.csv", keep_to=begin)
         self.board = _tensorboard(run, purge_step=begin)
         self.end, self.console = end, console
         self.begun = time.monotonic() - seconds
@@ -98,7 +98,7 @@ class Log:
         self.last_shown = (begin, time.monotonic())
         self.printed_at = time.monotonic()
 
-    def __enter__(self) -> "Log":
+    def __enter__(self) -> "TrainingLog":
         self.bar.start()
         return self
 
@@ -152,7 +152,7 @@ class Log:
 class LogLosses:
     """A hook that logs the mean of the losses over every `every` steps."""
 
-    def __init__(self, log: Log, *, every: int) -> None:
+    def __init__(self, log: TrainingLog, *, every: int) -> None:
         self.log, self.every = log, every
         self.sums: dict[str, Tensor] = {}
         self.counts: dict[str, int] = {}

@@ -6,7 +6,7 @@ from sharpfield.core.errors import OptionError
 
 
 @dataclass(frozen=True)
-class Options:
+class TrainingOptions:
     """How to train, whatever the recipe."""
 
     steps: int | None = None

@@ -11,7 +11,7 @@ from sharpfield.core.protocols import Model
 from sharpfield.training.loop import fit
 from sharpfield.training.memory import GIB, MEMORY_FRACTION, available_bytes, plan_micro_batches
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 
 Build = Callable[[int], Model]
 """Builds the model, on its device, with schedules for a number of steps."""
@@ -30,7 +30,9 @@ class Plan:
     micro_batches: int
 
 
-def make_plan(build: Build, options: Options, *, steps: int, seconds: float) -> tuple[Plan, Model]:
+def make_plan(
+    build: Build, options: TrainingOptions, *, steps: int, seconds: float
+) -> tuple[Plan, Model]:
     """Choose steps and micro-batches of a new run, and build its model.
 
     Args:

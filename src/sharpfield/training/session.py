@@ -15,12 +15,18 @@ from rich.console import Console
 from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
-from sharpfield.training.checkpoint import Checkpoint, Progress, check_settings, recover, restore
+from sharpfield.training.checkpoint import (
+    Checkpoint,
+    TrainingProgress,
+    check_settings,
+    recover,
+    restore,
+)
 from sharpfield.training.hooks import every, every_seconds, require_finite
-from sharpfield.training.log import Log, LogLosses
+from sharpfield.training.log import LogLosses, TrainingLog
 from sharpfield.training.loop import Hook, fit
 from sharpfield.training.optim import adam
-from sharpfield.training.options import Options
+from sharpfield.training.options import TrainingOptions
 from sharpfield.training.plan import Build, Plan, make_plan
 from sharpfield.training.status import Checkpointer, TrainingStatus, read_status, write_status
 
@@ -83,7 +89,7 @@ GUARD_STEPS = 100
 def train(
     build: Build,
     run: Path,
-    options: Options,
+    options: TrainingOptions,
     *,
     steps: int,
     settings: Mapping[str, Any],
@@ -114,7 +120,7 @@ def train(
         saved = _resumed(run, options, settings, console)
         if saved is None:
             plan, model = make_plan(build, options, steps=steps, seconds=stop.seconds_left)
-            begin = Progress(0, plan.steps, plan.micro_batches, settings=dict(settings))
+            begin = TrainingProgress(0, plan.steps, plan.micro_batches, settings=dict(settings))
         else:
             plan = Plan(options.steps or saved.progress.planned_steps, saved.progress.micro_batches)
             model = build(plan.steps)
@@ -124,7 +130,7 @@ def train(
             restore(saved, model, optimizer)
         device = device_of(model)
         status = _status(run, plan, begin, device.type)
-        with Log(
+        with TrainingLog(
             run, begin=begin.step, end=plan.steps, seconds=status.seconds, console=console
         ) as log:
             log.print_line(_opening(plan, begin.step))
@@ -164,7 +170,7 @@ def require_unused(run: Path) -> None:
 
 
 def _resumed(
-    run: Path, options: Options, settings: Mapping[str, Any], console: Console
+    run: Path, options: TrainingOptions, settings: Mapping[str, Any], console: Console
 ) -> Checkpoint | None:
     """The checkpoint to resume from; None for a run that starts at step 0."""
     if not options.resume:
@@ -178,7 +184,7 @@ def _resumed(
     return saved
 
 
-def _status(run: Path, plan: Plan, begin: Progress, device: str) -> TrainingStatus:
+def _status(run: Path, plan: Plan, begin: TrainingProgress, device: str) -> TrainingStatus:
     """The status at the beginning of a session, also written to disk."""
     earlier = read_status(run) if begin.step else None
     status = TrainingStatus(
@@ -203,7 +209,7 @@ def _opening(plan: Plan, step: int) -> str:
 
 def _hooks(
     checkpointer: Checkpointer,
-    options: Options,
+    options: TrainingOptions,
     validate: Callable[[Model], float] | None,
     *,
     device: str,

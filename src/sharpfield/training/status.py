@@ -13,8 +13,8 @@ from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
-from sharpfield.training.checkpoint import Progress, save_best, save_last
-from sharpfield.training.log import Log
+from sharpfield.training.checkpoint import TrainingProgress, save_best, save_last
+from sharpfield.training.log import TrainingLog
 from sharpfield.training.loop import Hook
 from sharpfield.training.memory import Losses, peak_memory_mb
 
@@ -69,7 +69,9 @@ def read_status(run: Path) -> TrainingStatus | None:
 class Checkpointer:
     """Writes the checkpoints and the status of a run; its methods are hooks."""
 
-    def __init__(self, run: Path, log: Log, status: TrainingStatus, progress: Progress) -> None:
+    def __init__(
+        self, run: Path, log: TrainingLog, status: TrainingStatus, progress: TrainingProgress
+    ) -> None:
         """Begin a session.
 
         Args:
