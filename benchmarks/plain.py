@@ -112,7 +112,7 @@ class Plain(nn.Module):
         return {
             **blurred,
             "events": self._event_term(pairs, step),
-            "smooth": self.recipe.smooth * roughness,
+            "smooth": self.recipe.tv_weight * roughness,
         }
 
     def render(self, rays: Rays) -> Radiance:

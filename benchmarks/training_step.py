@@ -102,7 +102,7 @@ def built(
     model = recipe_for(contender, parts).build(capture, seed=0).to(device)
     if contender == PLAIN:
         plain = Plain(model)
-        return plain, Adam(plain.parameters(), lr=plain.recipe.rate)
+        return plain, Adam(plain.parameters(), lr=plain.recipe.lr)
     return model, adam(model)
 
 

@@ -80,10 +80,10 @@ def test_the_good_one_is_described_trained_and_evaluated(
     assert "few" in described and "1024 -> 16" in described
     assert "A field named as an option of the command." in described
     out = tmp_path / "run"
-    words = ("--preset", "few", "--steps", 2, "--recipe.threshold", 0.25, "--rate", 0.01)
+    words = ("--preset", "few", "--steps", 2, "--recipe.threshold", 0.25, "--lr", 0.01)
     assert run("train", "their-nerf", recorded, "--out", out, *words) == 0
     options = json.loads((out / "recipe.json").read_text())["options"]
-    assert (options["pixels"], options["threshold"], options["rate"]) == (16, 0.25, 0.01)
+    assert (options["pixels"], options["threshold"], options["lr"]) == (16, 0.25, 0.01)
     assert run("evaluate", out) == 0
     assert json.loads((out / "metrics.json").read_text())["mean"]["psnr"] > 0
 

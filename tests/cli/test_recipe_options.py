@@ -20,10 +20,10 @@ def trained(capture: Path, out: Path, *words: object) -> dict[str, Any]:
 
 
 def test_flags_win_over_presets(recorded: Path, tmp_path: Path) -> None:
-    options = trained(recorded, tmp_path / "run", "--smooth=0.5", "--volume.clear_before", 0.1)
+    options = trained(recorded, tmp_path / "run", "--tv-weight=0.5", "--volume.clear_before", 0.1)
     assert options["volume"]["kind"] == "voxels", "the preset's"
     assert options["volume"]["voxels"] == [0, 4000] and options["pixels"] == 16
-    assert options["smooth"] == 0.5 and options["volume"]["clear_before"] == 0.1
+    assert options["tv_weight"] == 0.5 and options["volume"]["clear_before"] == 0.1
 
 
 def test_flags_may_stand_before_the_capture(recorded: Path, tmp_path: Path) -> None:
@@ -36,7 +36,7 @@ def test_change_still_works_and_names_the_flags(
 ) -> None:
     words = ("--change", "volume.octaves=3,2", "decay=7")
     options = trained(recorded, tmp_path / "run", *words)
-    assert options["volume"]["octaves"] == [3, 2] and options["decay"] == 7
+    assert options["volume"]["octaves"] == [3, 2] and options["lr_decay_steps"] == 7
     said = capsys.readouterr().err.splitlines()
     assert said == ["note: --change will go; write --volume.octaves 3 2 --decay 7"]
 

@@ -10,8 +10,8 @@ from tests.recipes.moving import tiny_moving
 
 SMALL = DNeRF(
     steps=30,
-    rate=5e-3,
-    decay=100,
+    lr=5e-3,
+    lr_decay_steps=100,
     pixels=64,
     instants=3,
     scene=WarpedOptions(

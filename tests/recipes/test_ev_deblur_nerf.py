@@ -31,7 +31,7 @@ def small(recipe: Any, *, kind: str = "planes") -> Any:
     """The recipe at a size for tests; what is modelled stays."""
     kept = {"noise": recipe.volume.noise, "density": recipe.volume.density}
     waits = 10 if getattr(getattr(recipe, "frames", None), "frames_from", 1) > 1 else 1
-    recipe = replace(recipe.lasting(12), volume=replace(SMALL, kind=kind, **kept), rate=1e-2)
+    recipe = replace(recipe.lasting(12), volume=replace(SMALL, kind=kind, **kept), lr=1e-2)
     if isinstance(recipe, NeRF):
         return replace(recipe, pixels=64)
     few = {"pixels": 48, "blurred_pixels": 16, "instants": 3}
@@ -40,7 +40,7 @@ def small(recipe: Any, *, kind: str = "planes") -> Any:
         frames=replace(recipe.frames, blur_from=9, frames_from=waits, **few),
         kernel=replace(recipe.kernel, motions=2),
         events=replace(recipe.events, pairs=48),
-        smooth=1e-3,
+        tv_weight=1e-3,
     )
 
 
@@ -76,7 +76,7 @@ def test_every_variant_learns_from_whatever_there_is(
         "frames": tiny.without(events=True),
         "events": tiny.without(frames=True),
     }[streams]
-    recipe = replace(variant(name, tiny), rate=2e-2)
+    recipe = replace(variant(name, tiny), lr=2e-2)
     model = recipe.build(capture, 0)
     probe = range(recipe.steps, recipe.steps + 2)
     before = mean_loss(model, probe)
@@ -170,12 +170,16 @@ def test_stretching_keeps_the_published_milestones_in_proportion() -> None:
     recipe = EvDeblurNeRF()
     assert recipe.lasting(30_000) == recipe
     short = recipe.lasting(3000)
-    assert (short.frames.blur_from, short.decay, short.kernel.trust_every) == (120, 1000, 1000)
+    assert (short.frames.blur_from, short.lr_decay_steps, short.kernel.adaptive_share_every) == (
+        120,
+        1000,
+        1000,
+    )
     assert (short.prior.until, short.events.response_from) == (1000, 120)
 
 
 def test_published_rates_and_prior_weights(tiny: Capture) -> None:
-    recipe = replace(small(EvDeblurNeRF()), steps=30_000, decay=10_000, rate=5e-3)
+    recipe = replace(small(EvDeblurNeRF()), steps=30_000, lr_decay_steps=10_000, lr=5e-3)
     recipe = replace(recipe, prior=replace(recipe.prior, until=10_000))
     model = recipe.build(tiny, 0)
     # Iteration i (step i - 1) uses the exponent (i - 2) / 10 000.

@@ -13,16 +13,18 @@ from tests.recipes.moving import tiny_moving
 
 SMALL = EvDNeRF(
     steps=40,
-    rate=5e-3,
+    lr=5e-3,
     pairs=48,
-    curriculum=Curriculum(windows=(4, 8), stages=(0, 30), crop=4, times=8, warm_up=3),
+    curriculum=Curriculum(
+        windows=(4, 8), stages=(0, 30), crop_steps=4, opening_steps=8, warmup_steps=3
+    ),
     scene=WarpedOptions(width=16, depth=6, samples=(8, 8)),
 )
 
 
 def test_rates_at_golden_steps():
     curriculum = EvDNeRF().curriculum
-    rates = [curriculum.rate(s) for s in (0, 500, 1000, 99_999, 100_000, 150_500, 180_000)]
+    rates = [curriculum.lr_factor(s) for s in (0, 500, 1000, 99_999, 100_000, 150_500, 180_000)]
     assert rates == pytest.approx([0.1, 0.55, 1.0, 1.0, 0.1, 0.55, 1.0])
 
 
@@ -35,7 +37,7 @@ def test_windows_are_halved_twice():
 def test_a_shrunk_schedule_keeps_its_proportions():
     made = EvDNeRF().lasting(2000).curriculum
     assert made.stages == (0, 1000, 1500)
-    assert (made.crop, made.times, made.warm_up) == (20, 200, 10)
+    assert (made.crop_steps, made.opening_steps, made.warmup_steps) == (20, 200, 10)
 
 
 def test_predicting_nothing_costs_the_mean_square_of_scaled_counts():
@@ -44,18 +46,18 @@ def test_predicting_nothing_costs_the_mean_square_of_scaled_counts():
     seen = model.draw(0)["events"]
     measured = seen.measured(*model.threshold)
     found = model.error(torch.zeros(len(seen)), seen, 0)
-    torch.testing.assert_close(found, (measured / model.most(0)).square().mean())
+    torch.testing.assert_close(found, (measured / model.largest_change(0)).square().mean())
 
 
 def test_the_loss_is_least_at_the_compressed_change():
     """D = 2.2 E / M; events are recovered by the inverse factor."""
     model = SMALL.build(tiny_moving(), 0)
     seen = model.draw(0)["events"]
-    best = 2.2 * seen.measured(*model.threshold) / model.most(0)
+    best = 2.2 * seen.measured(*model.threshold) / model.largest_change(0)
     assert float(model.error(best, seen, 0)) < 1e-12
     light = torch.tensor([[0.2], [0.4]])
     change = model.log_light(light)[1] - model.log_light(light)[0]
-    expected = torch.tensor(2.0).log() * model.most(SMALL.steps) / 2.2
+    expected = torch.tensor(2.0).log() * model.largest_change(SMALL.steps) / 2.2
     torch.testing.assert_close(change, expected)
 
 
@@ -90,7 +92,7 @@ def test_the_coarse_network_learns_only_if_told():
 
 def test_forty_steps_explain_a_batch():
     """Better than predicting nothing."""
-    model = replace(SMALL, rate=2e-2).build(tiny_moving(), 0)
+    model = replace(SMALL, lr=2e-2).build(tiny_moving(), 0)
     optimizer, seen = adam(model), model.draw(20)["events"]
     nothing = model.error(torch.zeros(len(seen)), seen, 20)
     loss = nothing

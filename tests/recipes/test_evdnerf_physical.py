@@ -19,11 +19,13 @@ from tests.recipes.moving import tiny_moving
 
 SMALL = EvDNeRFPhysical(
     steps=40,
-    decay=40,
+    lr_decay_steps=40,
     pixels=32,
-    frames=20.0,
-    scene=MovingOptions(size=VoxelSizes(static=12, moving=8, moments=4), steps=16, empty=0.1),
-    windows=WindowOptions(spans=32, counted=32),
+    frame_weight=20.0,
+    scene=MovingOptions(
+        size=VoxelSizes(static=12, moving=8, moments=4), samples=16, density_weight=0.1
+    ),
+    windows=WindowOptions(exact=32, counted=32),
 )
 
 
@@ -63,7 +65,7 @@ def test_what_stands_still_makes_no_event_at_all():
 def test_empty_space_shows_the_background():
     model = SMALL.build(tiny_moving().without(frames=True), 0)
     with torch.no_grad():
-        model.scene.field.still[0][..., 0] = -40
+        model.scene.field.static[0][..., 0] = -40
         model.scene.field.behind.copy_(torch.tensor([0.0, 1.0, -1.0]))
     rays = model.sensor.expose(model.draw(0)["windows"])
     expected = torch.sigmoid(model.scene.field.behind).expand(*rays.shape, 3)
@@ -99,7 +101,7 @@ def test_voxels_move_only_within_the_hull():
     )
     assert torch.equal(held, told.possible) and held.any() and not held.all()
     assert not values[~held].any() and values[held].any()
-    assert (first[..., 0][told.solid] == SMALL.scene.solid).all()
+    assert (first[..., 0][told.solid] == SMALL.scene.moving_density).all()
     assert not first[..., 0][~told.solid].any()
 
 
@@ -161,13 +163,13 @@ def test_thresholds_are_learned_only_if_asked():
 def test_clocks_of_cameras_are_learned_only_if_asked():
     capture = tiny_moving().without(frames=True)
     seen = SMALL.build(capture, 0).draw(0)["windows"]
-    assert SMALL.build(capture, 0).on_time(seen) is seen
-    windows = replace(SMALL.windows, learn_late=True)
+    assert SMALL.build(capture, 0).without_offset(seen) is seen
+    windows = replace(SMALL.windows, learn_offset=True)
     model = learned(replace(SMALL, windows=windows), capture, 4)
-    assert model.late is not None and model.late.abs().max() > 0, "a loss depends on it"
+    assert model.offset is not None and model.offset.abs().max() > 0, "a loss depends on it"
     with torch.no_grad():
-        model.late.copy_(torch.tensor([0.1, 0.3, 0.2]))
+        model.offset.copy_(torch.tensor([0.1, 0.3, 0.2]))
     shift = torch.tensor([0.1, -0.1, 0.0])[seen.track]
-    true = model.on_time(seen)
+    true = model.without_offset(seen)
     torch.testing.assert_close(true.start, seen.start + shift)
     torch.testing.assert_close(true.end, seen.end + shift)

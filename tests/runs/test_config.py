@@ -24,7 +24,7 @@ CHANGED = RunConfig(
     8,
     ("events",),
 )
-OTHER = RunConfig("nerf", NeRF(rate=1e-3), "a folder/with spaces", 0, ("frames",))
+OTHER = RunConfig("nerf", NeRF(lr=1e-3), "a folder/with spaces", 0, ("frames",))
 
 
 @pytest.mark.parametrize("started", [PLAIN, CHANGED, OTHER])

@@ -1,4 +1,4 @@
-"""D-NeRF: a moving scene from frames. What events must beat where frames are blurred or few.
+"""D-NeRF: a dynamic scene from frames. The baseline for events where frames are blurred or few.
 
 A. Pumarola et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021. Frames may come
 from anywhere: a camera, another model's renders, or a network that makes images of events; see
@@ -47,15 +47,15 @@ PAPER = Paper(
 
 
 def draft(recipe: "DNeRF") -> "DNeRF":
-    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
+    """Smaller networks, fewer pixels, a higher learning rate; minutes on two CPU cores."""
     scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
-    return replace(recipe.lasting(2000), rate=2e-3, pixels=256, scene=scene)
+    return replace(recipe.lasting(2000), lr=2e-3, pixels=256, scene=scene)
 
 
 def standard(recipe: "DNeRF") -> "DNeRF":
     """Half as wide; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
-    return replace(recipe.lasting(40_000), rate=1e-3, pixels=1024, scene=scene)
+    return replace(recipe.lasting(40_000), lr=1e-3, pixels=1024, scene=scene)
 
 
 def published(recipe: "DNeRF") -> "DNeRF":
@@ -65,23 +65,24 @@ def published(recipe: "DNeRF") -> "DNeRF":
 
 @dataclass(frozen=True)
 class DNeRF:
-    """Frames of a moving scene, through a canonical scene and a deformation."""
+    """A dynamic scene from frames: a canonical radiance field and a deformation field."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = {"rate": "lr", "decay": "lr_decay_steps"}
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}
     )
 
     steps: int = 800_000
-    """Length of the schedule."""
-    rate: float = 5e-4
-    """First learning rate."""
-    decay: int = 500_000
-    """Steps in which it falls to a tenth."""
+    """Length of the schedule in steps."""
+    lr: float = 5e-4
+    """First learning rate (Adam)."""
+    lr_decay_steps: int = 500_000
+    """Steps in which the learning rate falls to a tenth."""
     pixels: int = 500
-    """Drawn per step."""
+    """Pixels per step."""
     instants: int = 1
-    """Of an exposure that lasts: 1 takes frames as they are."""
+    """Instants of a blurred exposure that are averaged; 1 takes frames as sharp."""
     scene: WarpedOptions = field(
         default_factory=lambda: WarpedOptions(
             colours=3, networks=2, density="relu", opaque_end=False, shared_jitter=True
@@ -90,15 +91,19 @@ class DNeRF:
 
     def lasting(self, steps: int) -> "DNeRF":
         """The same recipe with its whole schedule stretched or shrunk to `steps`."""
-        return replace(self, steps=steps, decay=max(round(self.decay * steps / self.steps), 1))
+        return replace(
+            self,
+            steps=steps,
+            lr_decay_steps=max(round(self.lr_decay_steps * steps / self.steps), 1),
+        )
 
     def build(self, capture: Capture, seed: int) -> "Model":
-        """The recipe on one capture."""
+        """The model of this recipe on one capture."""
         return Model(self, capture, seed)
 
 
 class Model(nn.Module):
-    """A moving scene and the frames it explains; events are not used."""
+    """A dynamic scene and its frames; events are not used."""
 
     heaviest_step = 0
 
@@ -113,10 +118,10 @@ class Model(nn.Module):
         instants = 1 if frames.exposure.instant.all() else recipe.instants
         camera, path = self.capture.camera, self.capture.trajectory
         self.shutter = Shutter(camera, path, instants, self.tone.encode)
-        self.rate = exponential(recipe.rate, recipe.rate / 10, until=recipe.decay)
+        self.lr = exponential(recipe.lr, recipe.lr / 10, until=recipe.lr_decay_steps)
 
     def draw(self, step: int) -> Batch:
-        """Pixels of the training frames."""
+        """A random batch of pixels of the training frames."""
         return {
             "frames": draw_pixels(
                 self.pixels,
@@ -128,7 +133,7 @@ class Model(nn.Module):
         }
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Error of the pixels, coarse and fine."""
+        """Squared error of the pixels, coarse and fine."""
         assert isinstance(seen := batch["frames"], Pixels)
         light = self.scene.sharp(self.shutter.expose(seen), step, "frames")
         names = ("coarse", "fine") if light.coarse is not None else ("fine",)
@@ -138,13 +143,13 @@ class Model(nn.Module):
         }
 
     def render(self, rays: Rays) -> Radiance:
-        """Linear light."""
+        """Linear light along rays."""
         return self.scene.view(rays)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As the frames store it."""
+        """Linear light as stored values, 0...1."""
         return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
-        """All networks at one rate."""
-        return self.scene.groups(self.rate)
+        """Parameters of all networks with their learning rate."""
+        return self.scene.groups(self.lr)

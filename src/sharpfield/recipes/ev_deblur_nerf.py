@@ -1,9 +1,9 @@
-"""Ev-DeblurNeRF: a sharp static scene from blurry frames and events.
+"""Ev-DeblurNeRF: a sharp static radiance field from blurry frames and events.
 
 M. Cannici and D. Scaramuzza, *Mitigating Motion Blur in Neural Radiance Fields with Events and
-Frames*, CVPR 2024. Every pair of successive events of a pixel says how much log light changed
-between two instants; every blurry pixel is a weighted mean of sharp light. The weights are either
-learned for each image (the paper) or those of the known motion (`physical`).
+Frames*, CVPR 2024. Every pair of successive events of a pixel gives the change of log intensity
+between two instants; every blurry pixel is a weighted mean of sharp light. Its weights are a kernel
+learned for each image (the paper), or those of the known camera motion (`physical`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,7 +31,7 @@ from sharpfield.recipes.volume.frame_terms import (
     PriorOptions,
     Terms,
 )
-from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, trust
+from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, share_of_adaptive
 from sharpfield.recipes.volume.scene import (
     DRAFT,
     GRID_RATE,
@@ -81,10 +81,10 @@ NETWORK_RATE = 5e-3
 
 
 def blender_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
-    """The paper's recipe for its synthetic data."""
+    """The paper's numbers for its synthetic data."""
     return replace(
         recipe,
-        smooth=1.0,
+        tv_weight=1.0,
         frames=FrameOptions(),
         kernel=KernelOptions(),
         events=EventOptions(),
@@ -93,7 +93,7 @@ def blender_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
 
 
 def blender_minus(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
-    """Ev-DeblurNeRF--: no prior and no learned response; events follow display values."""
+    """Ev-DeblurNeRF-- of the paper: no EDI prior, gamma instead of a learned response."""
     return replace(
         blender_full(recipe),
         events=EventOptions(response="gamma"),
@@ -102,30 +102,30 @@ def blender_minus(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
 
 
 def cdavis_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
-    """The paper's recipe for its real data: colour events; frames count once blur is modelled."""
+    """The paper's numbers for real data: colour events; frames count once blur is modelled."""
     return replace(
         blender_full(recipe),
         frames=FrameOptions(frames_from=1201),
         events=EventOptions(pairs=2048, threshold=(0.25, 0.25), half_pixel=False),
-        prior=PriorOptions(weight=1.0, end=1.0),
+        prior=PriorOptions(weight=1.0, final_weight=1.0),
     )
 
 
 def physical(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
-    """Known motion instead of a learned kernel, sharp targets all along each exposure."""
+    """Known camera motion instead of a learned kernel, EDI targets all along an exposure."""
     return replace(
         recipe,
-        smooth=0.02,
+        tv_weight=0.02,
         volume=replace(recipe.volume, noise=0.0, density="softplus"),
         frames=FrameOptions(blur="auto", blurred_pixels=256, blur_from=20_000),
         kernel=KernelOptions(integration="samples", norm="layer"),
         events=EventOptions(response="residual"),
-        prior=PriorOptions(weight=1.0, end=0.1, until=30_000, domain="linear"),
+        prior=PriorOptions(weight=1.0, final_weight=0.1, until=30_000, domain="linear"),
     )
 
 
 def draft(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
-    """Minutes on two CPU cores: a dense grid instead of planes and networks."""
+    """Minutes on two CPU cores: a dense grid instead of feature volumes and networks."""
     recipe = recipe.lasting(2000)
     frames = recipe.frames
     frames = replace(
@@ -137,15 +137,13 @@ def draft(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
     )
     return replace(
         recipe,
-        rate=GRID_RATE,
-        decay=1000,
-        smooth=0.0,
+        lr=GRID_RATE,
+        lr_decay_steps=1000,
+        tv_weight=0.0,
         volume=replace(recipe.volume, **DRAFT),
         frames=frames,
-        kernel=replace(recipe.kernel, rate=NETWORK_RATE),
-        events=replace(
-            recipe.events, pairs=512, weight=2 * recipe.events.weight, rate=NETWORK_RATE
-        ),
+        kernel=replace(recipe.kernel, lr=NETWORK_RATE),
+        events=replace(recipe.events, pairs=512, weight=2 * recipe.events.weight, lr=NETWORK_RATE),
     )
 
 
@@ -167,7 +165,7 @@ def published(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
         samples=whole.samples,
         precision="auto",
     )
-    return replace(recipe.lasting(30_000), rate=5e-3, volume=volume)
+    return replace(recipe.lasting(30_000), lr=5e-3, volume=volume)
 
 
 def variant_for(capture: Capture, size: str) -> str:
@@ -180,9 +178,20 @@ def variant_for(capture: Capture, size: str) -> str:
 
 @dataclass(frozen=True)
 class EvDeblurNeRF:
-    """Blurry frames and events to a sharp static scene. Defaults: the paper's synthetic recipe."""
+    """A sharp static scene from blurry frames and events. Defaults: the paper's synthetic data."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = {
+        "rate": "lr",
+        "decay": "lr_decay_steps",
+        "smooth": "tv_weight",
+        "grids_faster": "grid_lr_factor",
+        "kernel.rate": "kernel.lr",
+        "kernel.trust": "kernel.adaptive_share",
+        "kernel.trust_every": "kernel.adaptive_share_every",
+        "events.rate": "events.lr",
+        "prior.end": "prior.final_weight",
+    }
     presets: ClassVar[Presets] = Presets(
         variants={
             "physical": physical,
@@ -195,15 +204,15 @@ class EvDeblurNeRF:
     )
 
     steps: int = 30_000
-    """Length of the schedule."""
-    rate: float = 5e-3
-    """First learning rate of everything."""
-    grids_faster: float = 1.0
-    """Factor on the rate of planes and lines."""
-    decay: int = 10_000
-    """Steps in which it falls to a tenth."""
-    smooth: float = 1.0
-    """Weight of the total variation."""
+    """Length of the schedule in steps."""
+    lr: float = 5e-3
+    """First learning rate of all parameters (Adam)."""
+    grid_lr_factor: float = 1.0
+    """Factor on the learning rate of planes and lines."""
+    lr_decay_steps: int = 10_000
+    """Steps in which the learning rate falls to a tenth."""
+    tv_weight: float = 1.0
+    """Weight of the total variation of planes and lines, or of the dense grid."""
     volume: VolumeOptions = field(default_factory=VolumeOptions)
     frames: FrameOptions = field(default_factory=FrameOptions)
     kernel: KernelOptions = field(default_factory=KernelOptions)
@@ -220,13 +229,15 @@ class EvDeblurNeRF:
         return replace(
             self,
             steps=steps,
-            decay=stretched(self.decay),
+            lr_decay_steps=stretched(self.lr_decay_steps),
             frames=replace(
                 frames,
                 blur_from=stretched(frames.blur_from),
                 frames_from=stretched(frames.frames_from),
             ),
-            kernel=replace(self.kernel, trust_every=stretched(self.kernel.trust_every)),
+            kernel=replace(
+                self.kernel, adaptive_share_every=stretched(self.kernel.adaptive_share_every)
+            ),
             events=replace(
                 events,
                 response_from=stretched(events.response_from),
@@ -236,12 +247,12 @@ class EvDeblurNeRF:
         )
 
     def build(self, capture: Capture, seed: int) -> "Model":
-        """The recipe on one capture."""
+        """The model of this recipe on one capture."""
         return Model(self, capture, seed)
 
 
 class Model(nn.Module):
-    """The recipe on one capture. Frames, events, or both: what is missing is left out."""
+    """The model on one capture; terms of missing frames or events are left out."""
 
     def __init__(self, recipe: EvDeblurNeRF, capture: Capture, seed: int) -> None:
         super().__init__()
@@ -260,15 +271,15 @@ class Model(nn.Module):
         self.tone = tone_of(capture.frames.encoding if capture.frames else "linear")
         self.events = EventTerm(recipe.events, self.capture, seed) if use_events else None
         self.frames = self._frame_term() if use_frames else None
-        self.rate = exponential(recipe.rate, recipe.rate / 10, begin=1, until=recipe.decay + 1)
+        self.lr = exponential(recipe.lr, recipe.lr / 10, begin=1, until=recipe.lr_decay_steps + 1)
 
     @property
     def heaviest_step(self) -> int:
-        """The first step that models blur."""
+        """The first step with several rays per pixel."""
         return self.recipe.frames.blur_from - 1 if self.frames is not None else 0
 
     def draw(self, step: int) -> Batch:
-        """Pixels of frames and pairs of events."""
+        """Random pixels of frames and random pairs of events."""
         batch: Batch = {}
         if self.frames is not None:
             batch["frames"] = self.frames.draw(step, self.volume.device)
@@ -277,7 +288,7 @@ class Model(nn.Module):
         return batch
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """The frames' terms, the events' term, and smoothness."""
+        """Blur, adaptive, prior and event terms, and the total variation."""
         terms: Terms = {}
         if self.frames is not None:
             assert isinstance(seen := batch["frames"], Pixels)
@@ -285,8 +296,8 @@ class Model(nn.Module):
         if self.events is not None:
             assert isinstance(pairs := batch["events"], EventPairs)
             terms |= self._event_terms(self.events, pairs, step)
-        if self.recipe.smooth > 0:
-            terms["smooth"] = self.recipe.smooth * self.volume.smoothness()
+        if self.recipe.tv_weight > 0:
+            terms["smooth"] = self.recipe.tv_weight * self.volume.smoothness()
         return terms
 
     def _event_terms(self, events: EventTerm, seen: EventPairs, step: int) -> Terms:
@@ -299,31 +310,31 @@ class Model(nn.Module):
         return terms
 
     def render(self, rays: Rays) -> Radiance:
-        """Sharp linear light, without kernel or noise."""
+        """Sharp linear light along rays, without kernel or noise."""
         return self.volume.view(rays)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As the frames store it."""
+        """Linear light as stored values, 0...1."""
         return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
-        """Networks, grids, kernel and response, all at one rate unless a recipe says otherwise."""
+        """Parameters of networks, grids, kernel and response with their learning rates."""
         recipe = self.recipe
 
         def at(own: float | None) -> Schedule:
-            return self.rate if own is None else scaled(self.rate, own / recipe.rate)
+            return self.lr if own is None else scaled(self.lr, own / recipe.lr)
 
-        groups = self.volume.groups(self.rate, scaled(self.rate, recipe.grids_faster))
+        groups = self.volume.groups(self.lr, scaled(self.lr, recipe.grid_lr_factor))
         if self.frames is not None and (kernel := tuple(self.frames.parameters())):
-            groups.append(Group("kernel", kernel, at(recipe.kernel.rate)))
+            groups.append(Group("kernel", kernel, at(recipe.kernel.lr)))
         if self.events is not None:
-            groups += self.events.groups(at(recipe.events.rate))
+            groups += self.events.groups(at(recipe.events.lr))
         return groups
 
     def _frame_term(self) -> KernelTerm | MotionTerm:
         recipe, volume = self.recipe, self.volume
         prior, until = recipe.prior, recipe.prior.until
-        weight = cosine(prior.weight, prior.end, begin=0, until=until)
+        weight = cosine(prior.weight, prior.final_weight, begin=0, until=until)
         known = self.capture.known.motion != "unknown"
         sharpened = self.events is not None and prior.weight > 0 and known
         if recipe.frames.blur == "motion" or (recipe.frames.blur == "auto" and known):
@@ -345,13 +356,13 @@ class Model(nn.Module):
                 features=volume.feature_width,
                 seed=self.seed,
             )
-        trusted = trust(recipe.kernel, begin=recipe.frames.blur_from, steps=recipe.steps)
+        share = share_of_adaptive(recipe.kernel, begin=recipe.frames.blur_from, steps=recipe.steps)
         return KernelTerm(
             recipe.frames,
             volume,
             self.tone.encode,
             weight,
             blur=blur,
-            trusted=trusted,
+            share=share,
             prior=middle,
         )

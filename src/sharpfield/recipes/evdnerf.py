@@ -1,8 +1,9 @@
-"""EvDNeRF: a moving scene from the events of several views that stand still.
+"""EvDNeRF: a dynamic scene from the events of several static cameras.
 
 A. Bhattacharya et al., *EvDNeRF: Reconstructing Event Data with Dynamic Neural Radiance Fields*,
 WACV 2024. The change of log intensity of a pixel in a window of time is fitted to the events that
-were counted in it. Windows become shorter as training goes on, and begin with the earliest.
+were counted in it. Windows become shorter in the course of training (varied batching), and early
+ones are opened first.
 """
 
 from dataclasses import dataclass, field, replace
@@ -52,38 +53,38 @@ PAPER = Paper(
         "One run goes through all stages and keeps the moments of Adam; the released code is"
         " started once for each.",
         "Samples lie between two distances along the ray; the released code takes planar depths.",
-        "Lost on purpose: image loss, distortion loss, sawtooth times and count batches, which no"
-        " published configuration switches on.",
+        "Left out on purpose: image loss, distortion loss, sawtooth times and count batches, which"
+        " no published configuration switches on.",
     ),
 )
 
 
 @dataclass(frozen=True)
 class Curriculum:
-    """What is looked at when."""
+    """Curriculum of event windows (varied batching)."""
 
     windows: tuple[int, ...] = (31, 63, 127)
-    """Windows that the capture is cut into, stage by stage: varied batching."""
+    """Number of windows that the capture is divided into, for each stage."""
     stages: tuple[int, ...] = (0, 100_000, 150_000)
-    """Steps at which they begin."""
-    crop: int = 2_000
-    """Steps in which only a box around the first events is looked at."""
-    times: int = 20_000
-    """Steps in which later and later windows are opened."""
-    warm_up: int = 1_000
-    """Steps at the beginning of each stage in which the rate grows from a tenth."""
+    """First step of each stage."""
+    crop_steps: int = 2_000
+    """Steps in which only pixels in a box around the first events are sampled."""
+    opening_steps: int = 20_000
+    """Steps over which later and later windows are opened."""
+    warmup_steps: int = 1_000
+    """Steps at the beginning of each stage in which the learning rate grows from a tenth."""
 
     def stage(self, step: int) -> int:
-        """Which stage a step belongs to."""
+        """Stage of a step."""
         return sum(step >= begin for begin in self.stages) - 1
 
-    def rate(self, step: int) -> float:
+    def lr_factor(self, step: int) -> float:
         """Factor on the learning rate."""
         since = step - self.stages[self.stage(step)]
-        return min(0.1 + 0.9 * since / self.warm_up, 1.0)
+        return min(0.1 + 0.9 * since / self.warmup_steps, 1.0)
 
     def lasting(self, factor: float) -> "Curriculum":
-        """Stretched or shrunk."""
+        """The same curriculum with all its steps multiplied."""
 
         def stretched(number: int) -> int:
             return max(round(number * factor), 1)
@@ -91,34 +92,36 @@ class Curriculum:
         return replace(
             self,
             stages=(0, *(stretched(begin) for begin in self.stages[1:])),
-            crop=stretched(self.crop),
-            times=stretched(self.times),
-            warm_up=stretched(self.warm_up),
+            crop_steps=stretched(self.crop_steps),
+            opening_steps=stretched(self.opening_steps),
+            warmup_steps=stretched(self.warmup_steps),
         )
 
 
 def lego(recipe: "EvDNeRF") -> "EvDNeRF":
-    """The paper's recipe for low contrast: a dead zone, and a tenth of the rate."""
-    return replace(recipe, rate=recipe.rate / 10, dead_zone=True)
+    """The paper's numbers for low contrast: a dead zone, and a tenth of the learning rate."""
+    return replace(recipe, lr=recipe.lr / 10, dead_zone=True)
 
 
 def real(recipe: "EvDNeRF") -> "EvDNeRF":
-    """The paper's recipe for real data: two networks, no compression."""
-    curriculum = replace(recipe.curriculum, windows=(99,), stages=(0,), crop=5_000, times=30_000)
+    """The paper's numbers for real data: two networks, no compression of log intensity."""
+    curriculum = replace(
+        recipe.curriculum, windows=(99,), stages=(0,), crop_steps=5_000, opening_steps=30_000
+    )
     scene = replace(recipe.scene, networks=2)
     return replace(recipe, steps=50_000, gamma=0.0, curriculum=curriculum, scene=scene)
 
 
 def draft(recipe: "EvDNeRF") -> "EvDNeRF":
-    """Smaller networks, fewer pixels, a higher rate; minutes on two CPU cores."""
+    """Smaller networks, fewer pixels, a higher learning rate; minutes on two CPU cores."""
     scene = replace(recipe.scene, width=64, depth=6, samples=(24, 24))
-    return replace(recipe.lasting(2000), rate=10 * recipe.rate, pairs=128, scene=scene)
+    return replace(recipe.lasting(2000), lr=10 * recipe.lr, pairs=128, scene=scene)
 
 
 def standard(recipe: "EvDNeRF") -> "EvDNeRF":
     """Half as wide and a tenth as long; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
-    return replace(recipe.lasting(20_000), rate=5 * recipe.rate, scene=scene)
+    return replace(recipe.lasting(20_000), lr=5 * recipe.lr, scene=scene)
 
 
 def published(recipe: "EvDNeRF") -> "EvDNeRF":
@@ -128,35 +131,43 @@ def published(recipe: "EvDNeRF") -> "EvDNeRF":
 
 @dataclass(frozen=True)
 class EvDNeRF:
-    """Events of several still views to a moving scene. Defaults: the paper's simulated scenes."""
+    """A dynamic scene from events of static cameras. Defaults: the paper's simulated scenes."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = {
+        "rate": "lr",
+        "one_scale": "fixed_scale",
+        "curriculum.crop": "curriculum.crop_steps",
+        "curriculum.times": "curriculum.opening_steps",
+        "curriculum.warm_up": "curriculum.warmup_steps",
+    }
     presets: ClassVar[Presets] = Presets(
         variants={"lego": lego, "real": real},
         sizes={"draft": draft, "standard": standard, "paper": published},
     )
 
     steps: int = 200_000
-    """Length of the schedule."""
-    rate: float = 1e-4
-    """Learning rate after each warm-up."""
+    """Length of the schedule in steps."""
+    lr: float = 1e-4
+    """Learning rate after each warm-up (Adam)."""
     pairs: int = 1024
-    """Pixels drawn per step, each of an event frame of its own."""
+    """Pixels per step, each of a random event frame."""
     threshold: tuple[float, float] | None = None
-    """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
+    """Contrast threshold to darker and to brighter, natural log; None takes that of the capture,
+    or 0.2."""
     gamma: float = 2.2
-    """The predicted change is divided by this and the measured one by its largest value, so that
-    what is learned is log intensity with its range compressed; 0 divides both by the latter."""
+    """Compression of log intensity: the predicted change is divided by this, the measured one by
+    its largest value; 0 divides both by the latter, without compression."""
     dead_zone: bool = False
-    """Changes within a threshold beyond the measured one cost nothing (published for low-contrast
-    data); replaces `gamma`."""
+    """Whether differences within one threshold cost nothing, published for low-contrast data; no
+    compression then."""
     halved: Halved = "no"
-    """Whether blocks of two by two pixels count as one."""
-    one_scale: bool = False
-    """The largest change is that of the first stage throughout; released: of each stage, so that
-    the scale of what is learned jumps."""
+    """Whether events of 2x2 pixels are summed to half the resolution, fairly or as released."""
+    fixed_scale: bool = False
+    """Whether the largest change is that of the first stage in all stages; released: of each stage,
+    so that the scale of the learned log intensity jumps."""
     coarse_loss: bool = False
-    """With two networks, the coarse one is taught, too; released: it never is."""
+    """Whether the coarse one of two networks has a loss; it never has in the released code."""
     curriculum: Curriculum = field(default_factory=Curriculum)
     scene: WarpedOptions = field(default_factory=WarpedOptions)
 
@@ -166,12 +177,12 @@ class EvDNeRF:
         return replace(self, steps=steps, curriculum=curriculum)
 
     def build(self, capture: Capture, seed: int) -> "Model":
-        """The recipe on one capture."""
+        """The model of this recipe on one capture."""
         return Model(self, capture, seed)
 
 
 class Model(nn.Module):
-    """A moving scene and the event frames it explains; frames are not used."""
+    """A dynamic scene and its event frames; frames are not used."""
 
     heaviest_step = 0
 
@@ -191,65 +202,65 @@ class Model(nn.Module):
         self.sensor = LogContrast(self.capture.camera, path, FixedResponse(floor=FLOOR))
 
     def draw(self, step: int) -> Batch:
-        """Half event pixels, half any pixels, of the open windows of this stage."""
+        """Pixels of the open windows of this stage: half with events, half any."""
         curriculum, table = self.recipe.curriculum, self._table(step)
         seen = draw_binned(
             table,
             self.recipe.pairs,
             seed=self.seed,
             step=step,
-            until=open_windows(step, table.net.shape[1], curriculum.times),
-            cropped=step < curriculum.crop,
+            until=open_windows(step, table.net.shape[1], curriculum.opening_steps),
+            cropped=step < curriculum.crop_steps,
             device=self.scene.device,
         )
         return {"events": seen}
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Error of the change in each window."""
+        """Error of the change of log intensity in each window."""
         assert isinstance(seen := batch["events"], EventPairs)
         light = self.scene.sharp(self.sensor.expose(seen), step, "events")
-        taught = stages(light) if self.recipe.coarse_loss else [light]
+        levels = stages(light) if self.recipe.coarse_loss else [light]
         errors = [
-            self.error(self.sensor.observe(stage, seen)[:, 0], seen, step) for stage in taught
+            self.error(self.sensor.observe(stage, seen)[:, 0], seen, step) for stage in levels
         ]
         return {"events": torch.stack(errors).sum()}
 
     def error(
         self, predicted: Float[Tensor, "b"], seen: EventPairs, step: int
     ) -> Float[Tensor, ""]:
-        """How far changes are from what was counted."""
+        """Error of predicted changes against counted events."""
         measured = seen.measured(*self.threshold)
         if self.recipe.dead_zone:
             return dead_zone_error(predicted, measured, sum(self.threshold) / 2)
-        most = self.most(step)
+        largest = self.largest_change(step)
         return scaled_error(
-            predicted, measured, scale=self.recipe.gamma or most, measured_scale=most
+            predicted, measured, scale=self.recipe.gamma or largest, measured_scale=largest
         )
 
-    def most(self, step: int) -> float:
-        """Largest measured change of the stage of a step."""
-        table = self.tables[0] if self.recipe.one_scale else self._table(step)
+    def largest_change(self, step: int) -> float:
+        """Largest measured change in the stage of a step, natural log."""
+        table = self.tables[0] if self.recipe.fixed_scale else self._table(step)
         return max(table.most, 1) * max(self.threshold)
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
-        """As the event camera sees it, after the last stage: what is learned is compressed."""
+        """Log intensity of the event camera after the last stage, the compression undone."""
         log = (luma(light) + FLOOR).log()
         if self.recipe.dead_zone or not self.recipe.gamma:
             return log
-        return log * (self.most(self.recipe.steps) / self.recipe.gamma)
+        return log * (self.largest_change(self.recipe.steps) / self.recipe.gamma)
 
     def render(self, rays: Rays) -> Radiance:
-        """Light, up to a power and a factor."""
+        """Light along rays, known up to a power and a factor."""
         return self.scene.view(rays)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As it is: events do not tell how frames would store it."""
+        """Light as it is: there are no frames whose encoding could be applied."""
         return light.clamp(0, 1)
 
     def groups(self) -> list[Group]:
-        """All networks at one rate."""
+        """Parameters of all networks with their learning rate."""
         recipe = self.recipe
-        return self.scene.groups(lambda step: recipe.rate * recipe.curriculum.rate(step))
+        return self.scene.groups(lambda step: recipe.lr * recipe.curriculum.lr_factor(step))
 
     def _table(self, step: int) -> BinnedTable:
         return self.tables[self.recipe.curriculum.stage(step)]

@@ -1,11 +1,11 @@
-"""EvDNeRF made physical: a moving scene from events of several views, and frames if there are any.
+"""EvDNeRF made physical: a dynamic scene from events of several cameras, and frames if any.
 
-It asks the same of a scene as A. Bhattacharya et al., *EvDNeRF: Reconstructing Event Data with
-Dynamic Neural Radiance Fields*, WACV 2024, but keeps to what an event says. Density is unbounded
-and the background the same at all times; both instants of a window are seen at the same points, so
-that what stands still makes no event at all; events are counted exactly in windows of any length,
-at full resolution. Windows that end with events of their pixel are exact; others say as much as
-their counts do, up to a threshold.
+The task of A. Bhattacharya et al., *EvDNeRF: Reconstructing Event Data with Dynamic Neural Radiance
+Fields*, WACV 2024, with an exact event model. Density is unbounded and the background constant.
+Both instants of a window are rendered at the same samples, so that what is static makes no event at
+all. Events are counted in windows of any length, at full resolution. The change of log intensity in
+a window that begins and ends with events of its pixel is known exactly; in other windows up to a
+threshold.
 """
 
 from dataclasses import dataclass, field, replace
@@ -43,77 +43,99 @@ PAPER = replace(
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Which windows of events are looked at, and how far each is trusted."""
+    """Windows of events in a batch, and their errors."""
 
-    spans: int = 128
-    """Windows drawn per step that begin and end with an event."""
+    exact: int = 128
+    """Windows per step that begin and end with an event of their pixel."""
     counted: int = 640
-    """Other windows drawn per step."""
-    busy: float = 0.5
-    """Share of these that hold an event for certain; the others are of any pixel."""
+    """Other windows per step."""
+    active_fraction: float = 0.5
+    """Fraction of the other windows at pixels with an event in them; the rest are at any pixel."""
     lengths: Lengths = Lengths(shortest=1 / 8)
-    """Long ones tell most: one end often sees what stands still. Spans may be short."""
-    pull: float = 0.2
-    """How much of the difference counts where it may be what is left over."""
+    """Lengths of the other windows. Long ones tell most, as one end often sees the static
+    background; exact windows may be short."""
+    residual_weight: float = 0.2
+    """Weight of an error that a change below the threshold may explain."""
     threshold: tuple[float, float] | None = None
-    """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
+    """Contrast threshold to darker and to brighter, natural log; None takes that of the capture,
+    or 0.2."""
     learn_threshold: bool = False
-    """Refine one threshold for each sign (with frames: events alone cannot tell their size)."""
-    learn_late: bool = False
-    """Learn by how much the clock of each camera is late against the mean of all."""
-    late_rate_us: float = 100.0
-    """First learning rate of that."""
+    """Learn one threshold for each polarity; needs frames, as events leave their scale open."""
+    learn_offset: bool = False
+    """Learn the clock offset of each camera against the mean of all cameras."""
+    offset_lr_us: float = 100.0
+    """First learning rate of the clock offsets, in us a step."""
     floor: float = 1e-5
-    """Light added before the logarithm, where the capture does not note it."""
+    """Linear light added before the logarithm, where the capture does not state it."""
 
 
 def draft(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
     """Minutes on two CPU cores."""
-    windows = replace(recipe.windows, spans=64, counted=320)
+    windows = replace(recipe.windows, exact=64, counted=320)
     return replace(recipe.lasting(2000), windows=windows)
 
 
 def standard(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
     """Finer in space and time; an hour on a CPU."""
     size = VoxelSizes(static=96, moving=80, moments=48)
-    scene = replace(recipe.scene, size=size, steps=96)
-    windows = replace(recipe.windows, spans=256, counted=1280)
+    scene = replace(recipe.scene, size=size, samples=96)
+    windows = replace(recipe.windows, exact=256, counted=1280)
     return replace(recipe.lasting(12_000), scene=scene, windows=windows)
 
 
 @dataclass(frozen=True)
 class EvDNeRFPhysical:
-    """Events of a moving scene, counted exactly, and frames if there are any."""
+    """A dynamic scene from exactly counted events, and from frames if there are any."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = {
+        "rate": "lr",
+        "decay": "lr_decay_steps",
+        "frames": "frame_weight",
+        "scene.steps": "scene.samples",
+        "scene.clear": "scene.static_density",
+        "scene.solid": "scene.moving_density",
+        "scene.empty": "scene.density_weight",
+        "scene.smooth": "scene.tv_weight",
+        "scene.steady": "scene.time_tv_weight",
+        "windows.spans": "windows.exact",
+        "windows.busy": "windows.active_fraction",
+        "windows.pull": "windows.residual_weight",
+        "windows.learn_late": "windows.learn_offset",
+        "windows.late_rate_us": "windows.offset_lr_us",
+    }
     presets: ClassVar[Presets] = Presets(sizes={"draft": draft, "standard": standard})
 
     steps: int = 6000
-    """Length of the schedule."""
-    rate: float = 0.1
-    """First learning rate of voxels."""
-    decay: int = 6000
-    """Steps in which it falls to a tenth."""
+    """Length of the schedule in steps."""
+    lr: float = 0.1
+    """First learning rate of the voxels (Adam)."""
+    lr_decay_steps: int = 6000
+    """Steps in which the learning rate falls to a tenth."""
     scene: MovingOptions = field(default_factory=MovingOptions)
     windows: WindowOptions = field(default_factory=WindowOptions)
     pixels: int = 512
-    """Pixels of frames drawn per step, if there are frames."""
+    """Pixels of frames per step, if there are frames."""
     instants: int = 3
-    """Instants of an exposure that lasts."""
-    frames: float = 500.0
-    """Weight of the frames."""
+    """Instants of a blurred exposure that are averaged."""
+    frame_weight: float = 500.0
+    """Weight of the squared error of frames."""
 
     def lasting(self, steps: int) -> "EvDNeRFPhysical":
         """The same recipe with its whole schedule stretched or shrunk to `steps`."""
-        return replace(self, steps=steps, decay=max(round(self.decay * steps / self.steps), 1))
+        return replace(
+            self,
+            steps=steps,
+            lr_decay_steps=max(round(self.lr_decay_steps * steps / self.steps), 1),
+        )
 
     def build(self, capture: Capture, seed: int) -> "Model":
-        """The recipe on one capture."""
+        """The model of this recipe on one capture."""
         return Model(self, capture, seed)
 
 
 class Model(nn.Module):
-    """A moving scene, and the events and frames it explains."""
+    """A dynamic scene, its events and its frames."""
 
     heaviest_step = 0
 
@@ -131,22 +153,22 @@ class Model(nn.Module):
         self.sensor = LogContrast(camera, path, FixedResponse(floor=self.floor))
         kind = LearnedThresholds if recipe.windows.learn_threshold else FixedThresholds
         self.thresholds = kind(*thresholds_of(capture, recipe.windows.threshold))
-        unknown = recipe.windows.learn_late
-        self.late = nn.Parameter(torch.zeros(index.tracks)) if unknown else None
-        """Of each track, in shares of the capture."""
+        unknown = recipe.windows.learn_offset
+        self.offset = nn.Parameter(torch.zeros(index.tracks)) if unknown else None
+        """Clock offset of each track, in units of the duration of the capture."""
         use_frames = capture.frames is not None and recipe.pixels > 0
         self.pixels = pixel_table(self.capture) if use_frames else None
         blurred = capture.frames is not None and not capture.frames.exposure.instant.all()
         instants = recipe.instants if blurred else 1
         self.shutter = Shutter(camera, path, instants, self.tone.encode)
-        self.rate = exponential(recipe.rate, recipe.rate / 10, until=recipe.decay)
+        self.lr = exponential(recipe.lr, recipe.lr / 10, until=recipe.lr_decay_steps)
 
     def draw(self, step: int) -> Batch:
-        """Spans and windows of events, and pixels of frames."""
+        """Exact windows, other windows, and pixels of frames."""
         options, device = self.recipe.windows, self.scene.device
         batch: Batch = {
             "spans": draw_spans(
-                self.table, options.spans, seed=self.seed, step=step, device=device
+                self.table, options.exact, seed=self.seed, step=step, device=device
             ),
             "windows": draw_windows(
                 self.table,
@@ -154,7 +176,7 @@ class Model(nn.Module):
                 options.lengths,
                 seed=self.seed,
                 step=step,
-                busy=options.busy,
+                busy=options.active_fraction,
                 device=device,
             ),
         }
@@ -165,11 +187,11 @@ class Model(nn.Module):
         return batch
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Errors of spans, of windows and of frames; how rough the scene is, and how foggy."""
+        """Errors of windows and frames, total variation, density penalty."""
         assert isinstance(spans := batch["spans"], EventPairs)
         assert isinstance(windows := batch["windows"], EventPairs)
         both = EventPairs.cat([spans, windows])
-        true = self.on_time(both)
+        true = self.without_offset(both)
         change = self.sensor.observe(
             self.scene.sharp(self.sensor.expose(true), step, "events"), true
         )
@@ -180,51 +202,58 @@ class Model(nn.Module):
         terms = {
             "spans": exact_error(change[exact], measured[exact], usual[exact]),
             "windows": counted_error(
-                change[counted], measured[counted], usual[counted], pull=self.recipe.windows.pull
+                change[counted],
+                measured[counted],
+                usual[counted],
+                pull=self.recipe.windows.residual_weight,
             ),
-            "rough": self.scene.roughness(step),
-            "fog": self.scene.fog(step),
+            "rough": self.scene.total_variation(step),
+            "fog": self.scene.density_penalty(step),
         }
         if isinstance(self.thresholds, LearnedThresholds):
             terms["thresholds"] = 1e-2 * self.thresholds.prior()
         if self.pixels is not None:
             assert isinstance(seen := batch["frames"], Pixels)
             light = self.scene.sharp(self.shutter.expose(seen), step, "frames")
-            terms["frames"] = self.recipe.frames * mse(
+            terms["frames"] = self.recipe.frame_weight * mse(
                 self.shutter.observe(light, seen), seen.value
             )
         return terms
 
-    def on_time(self, seen: EventPairs) -> EventPairs:
-        """Pairs at the times when things happened, instead of those on their cameras' clocks."""
-        if self.late is None:
+    def without_offset(self, seen: EventPairs) -> EventPairs:
+        """Pairs with the clock offsets of their cameras removed."""
+        if self.offset is None:
             return seen
-        late = (self.late - self.late.mean())[seen.track]
-        return replace(seen, start=seen.start - late, end=seen.end - late)
+        offset = (self.offset - self.offset.mean())[seen.track]
+        return replace(seen, start=seen.start - offset, end=seen.end - offset)
 
     def render(self, rays: Rays) -> Radiance:
-        """Sharp linear light."""
+        """Sharp linear light along rays."""
         return self.scene.view(rays)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As the frames store it."""
+        """Linear light as stored values, 0...1."""
         return self.tone.encode(light).clamp(0, 1)
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
-        """As the event camera sees it."""
+        """Log intensity of the event camera."""
         return (luma(light) + self.floor).log()
 
     def groups(self) -> list[Group]:
-        """Voxels, thresholds and clocks."""
-        groups = self.scene.groups(self.rate)
-        if self.late is not None:
-            rate = self.recipe.windows.late_rate_us / self.capture.clock.span_us
+        """Parameters of voxels, thresholds and clocks with their learning rates."""
+        groups = self.scene.groups(self.lr)
+        if self.offset is not None:
+            rate = self.recipe.windows.offset_lr_us / self.capture.clock.span_us
             groups.append(
-                Group("late", (self.late,), exponential(rate, rate / 20, until=self.recipe.decay))
+                Group(
+                    "late",
+                    (self.offset,),
+                    exponential(rate, rate / 20, until=self.recipe.lr_decay_steps),
+                )
             )
         if isinstance(self.thresholds, LearnedThresholds):
             own = tuple(self.thresholds.parameters())
             groups.append(
-                Group("thresholds", own, exponential(1e-3, 1e-4, until=self.recipe.decay))
+                Group("thresholds", own, exponential(1e-3, 1e-4, until=self.recipe.lr_decay_steps))
             )
         return groups

@@ -1,8 +1,8 @@
-"""NeRF: a sharp scene from frames taken as they are. The baseline that blur and events must beat.
+"""NeRF: a radiance field of frames taken as sharp. The baseline of recipes with blur or events.
 
 B. Mildenhall et al., *NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis*,
-ECCV 2020. With `volume.kind` "planes" or "voxels" the same method on factored feature volumes or a
-dense grid, which learn in minutes what the large networks learn in hours.
+ECCV 2020. With `volume.kind` `planes` (factored feature volumes) or `voxels` (a dense grid) the
+same method trains in minutes instead of hours.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,14 +40,16 @@ PAPER = Paper(
 
 
 def draft(recipe: "NeRF") -> "NeRF":
-    """A dense grid instead of large networks; minutes on two CPU cores."""
-    return NeRF(steps=2000, rate=GRID_RATE, decay=1000, pixels=1024, volume=VolumeOptions(**DRAFT))
+    """A dense grid instead of the networks; minutes on two CPU cores."""
+    return NeRF(
+        steps=2000, lr=GRID_RATE, lr_decay_steps=1000, pixels=1024, volume=VolumeOptions(**DRAFT)
+    )
 
 
 def standard(recipe: "NeRF") -> "NeRF":
-    """Planes; minutes on a GPU."""
+    """Factored feature volumes; minutes on a GPU."""
     volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **STANDARD)
-    return NeRF(steps=10_000, rate=5e-3, decay=3333, smooth=0.02, volume=volume)
+    return NeRF(steps=10_000, lr=5e-3, lr_decay_steps=3333, tv_weight=0.02, volume=volume)
 
 
 def published(recipe: "NeRF") -> "NeRF":
@@ -57,40 +59,50 @@ def published(recipe: "NeRF") -> "NeRF":
 
 @dataclass(frozen=True)
 class NeRF:
-    """Frames to a scene, blur and all."""
+    """A radiance field of frames taken as sharp. The baseline of the volume recipes."""
 
     paper: ClassVar[Paper] = PAPER
+    renamed: ClassVar[dict[str, str]] = {
+        "rate": "lr",
+        "decay": "lr_decay_steps",
+        "smooth": "tv_weight",
+        "grids_faster": "grid_lr_factor",
+    }
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}
     )
 
     steps: int = 200_000
-    """Length of the schedule."""
-    rate: float = 5e-4
-    """First learning rate."""
-    grids_faster: float = 1.0
-    """Factor on the rate of planes and lines."""
-    decay: int = 250_000
-    """Steps in which it falls to a tenth."""
-    smooth: float = 0.0
-    """Weight of the total variation of planes and lines."""
+    """Length of the schedule in steps."""
+    lr: float = 5e-4
+    """First learning rate (Adam)."""
+    grid_lr_factor: float = 1.0
+    """Factor on the learning rate of planes and lines."""
+    lr_decay_steps: int = 250_000
+    """Steps in which the learning rate falls to a tenth."""
+    tv_weight: float = 0.0
+    """Weight of the total variation of planes and lines, or of the dense grid."""
     pixels: int = 1024
-    """Drawn per step."""
+    """Pixels per step."""
     volume: VolumeOptions = field(
         default_factory=lambda: VolumeOptions(kind="mlp", samples=(64, 128))
     )
 
     def lasting(self, steps: int) -> "NeRF":
         """The same recipe with its whole schedule stretched or shrunk to `steps`."""
-        return replace(self, steps=steps, decay=max(round(self.decay * steps / self.steps), 1))
+        return replace(
+            self,
+            steps=steps,
+            lr_decay_steps=max(round(self.lr_decay_steps * steps / self.steps), 1),
+        )
 
     def build(self, capture: Capture, seed: int) -> "Model":
-        """The recipe on one capture."""
+        """The model of this recipe on one capture."""
         return Model(self, capture, seed)
 
 
 class Model(nn.Module):
-    """A field and the frames it explains, one ray per pixel."""
+    """A radiance field and its frames, one ray per pixel."""
 
     heaviest_step = 0
 
@@ -106,31 +118,31 @@ class Model(nn.Module):
             self.tone.encode,
             constant(0.0),
             blur=None,
-            trusted=constant(0.0),
+            share=constant(0.0),
             prior=None,
         )
-        self.rate = exponential(recipe.rate, recipe.rate / 10, until=recipe.decay)
+        self.lr = exponential(recipe.lr, recipe.lr / 10, until=recipe.lr_decay_steps)
 
     def draw(self, step: int) -> Batch:
-        """Pixels of the training frames."""
+        """A random batch of pixels of the training frames."""
         return {"frames": self.frames.draw(step, self.volume.device)}
 
     def losses(self, batch: Batch, step: int) -> Terms:
-        """Error of the pixels, fine and coarse."""
+        """Squared error of the pixels, fine and coarse, and the total variation."""
         assert isinstance(seen := batch["frames"], Pixels)
         terms = self.frames.terms(self.volume, seen, step)
-        if self.recipe.smooth > 0:
-            terms["smooth"] = self.recipe.smooth * self.volume.smoothness()
+        if self.recipe.tv_weight > 0:
+            terms["smooth"] = self.recipe.tv_weight * self.volume.smoothness()
         return terms
 
     def render(self, rays: Rays) -> Radiance:
-        """Linear light."""
+        """Linear light along rays."""
         return self.volume.view(rays)
 
     def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """As the frames store it."""
+        """Linear light as stored values, 0...1."""
         return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
-        """Networks and grids at one rate."""
-        return self.volume.groups(self.rate, scaled(self.rate, self.recipe.grids_faster))
+        """Parameters of networks and grids with their learning rates."""
+        return self.volume.groups(self.lr, scaled(self.lr, self.recipe.grid_lr_factor))

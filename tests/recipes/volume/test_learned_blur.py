@@ -7,7 +7,7 @@ from sharpfield.core.rays import Radiance, Samples
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import gamma
 from sharpfield.geometry.normalise import normalised
-from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, trust
+from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, share_of_adaptive
 
 PIXELS, RAYS, POINTS, FEATURES = 5, 4, 6, 7
 
@@ -47,14 +47,14 @@ def varied(capture: Capture, learned: LearnedBlur) -> Radiance:
 
 
 def test_trust_golden():
-    at = trust(KernelOptions(), begin=1200, steps=30_000)
+    at = share_of_adaptive(KernelOptions(), begin=1200, steps=30_000)
     wanted = {1200: 0.1, 9999: 0.1, 10_000: 0.195688, 20_000: 0.419649, 30_000: 0.899931}
     found = {iteration: at(iteration) for iteration in wanted}
     assert found == pytest.approx(wanted, abs=5e-7)
 
 
 def test_trust_is_a_staircase_that_never_falls():
-    at = trust(KernelOptions(trust_every=100), begin=150, steps=1000)
+    at = share_of_adaptive(KernelOptions(adaptive_share_every=100), begin=150, steps=1000)
     values = [at(iteration) for iteration in range(1, 1001)]
     assert sorted(values) == values
     assert len(set(values)) == 10  # 100 lies before 150: still the first value
@@ -64,7 +64,7 @@ def test_trust_is_a_staircase_that_never_falls():
 def test_one_colour_everywhere_has_the_same_error_under_any_weights(tiny: Capture):
     learned, seen = blur(tiny), pixels()
     grey = light(torch.full((PIXELS, RAYS, 3), 0.3), learned.expose(seen).weight)
-    terms = learned.losses(grey, seen, trusted=0.25, rigid=True)
+    terms = learned.losses(grey, seen, share=0.25, rigid=True)
     error = (gamma(torch.tensor(0.3)) - seen.value).square().mean()
     torch.testing.assert_close(terms["blur"], 0.75 * 2 * error)  # two stages
     torch.testing.assert_close(terms["adaptive"], 0.25 * error)  # the fine one alone
@@ -73,7 +73,7 @@ def test_one_colour_everywhere_has_the_same_error_under_any_weights(tiny: Captur
 def test_trust_divides_the_loss(tiny: Capture):
     learned, seen = blur(tiny), pixels()
     found = [
-        learned.losses(varied(tiny, learned), seen, trusted=share, rigid=True)
+        learned.losses(varied(tiny, learned), seen, share=share, rigid=True)
         for share in (0.0, 0.4, 1.0)
     ]
     assert found[0]["adaptive"] == 0 and found[2]["blur"] == 0
@@ -84,15 +84,15 @@ def test_trust_divides_the_loss(tiny: Capture):
 
 def test_before_the_rigid_term_counts_only_the_adaptive_one_does(tiny: Capture):
     learned = blur(tiny)
-    terms = learned.losses(varied(tiny, learned), pixels(), trusted=0.1, rigid=False)
+    terms = learned.losses(varied(tiny, learned), pixels(), share=0.1, rigid=False)
     assert terms.keys() == {"adaptive"}
 
 
 @pytest.mark.parametrize("without", [{"adaptive": False}, {"features": 0}])
 def test_without_a_network_all_trust_is_in_the_kernel(tiny: Capture, without: dict):
     learned, seen = blur(tiny, **without), pixels()
-    terms = learned.losses(varied(tiny, learned), seen, trusted=0.9, rigid=True)
-    full = blur(tiny).losses(varied(tiny, learned), seen, trusted=0.0, rigid=True)
+    terms = learned.losses(varied(tiny, learned), seen, share=0.9, rigid=True)
+    full = blur(tiny).losses(varied(tiny, learned), seen, share=0.0, rigid=True)
     assert terms.keys() == {"blur"}
     torch.testing.assert_close(terms["blur"], full["blur"])
 
@@ -114,7 +114,7 @@ def test_every_parameter_learns(tiny: Capture):
         torch.nn.init.normal_(code, std=0.3, generator=generator(0, 0, "grown"))
     rays = learned.expose(seen)
     bright = light(torch.sigmoid(rays.origin + rays.direction), rays.weight)
-    terms = learned.losses(bright, seen, trusted=0.5, rigid=True)
+    terms = learned.losses(bright, seen, share=0.5, rigid=True)
     torch.stack(list(terms.values())).sum().backward()
     idle = [
         name

@@ -1,4 +1,4 @@
-"""The event term shared by recipes: which pairs a step looks at, and how far off they are."""
+"""The event term of the volume recipes: pairs of events, responses, and the contrast error."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,33 +24,36 @@ from sharpfield.storage.event_cache import event_index
 
 @dataclass(frozen=True)
 class EventOptions:
-    """How events are explained. Defaults: Ev-DeblurNeRF's synthetic recipe."""
+    """The event loss. Defaults: Ev-DeblurNeRF's synthetic recipe."""
 
     weight: float = 0.1
-    """Of the event term; 0 leaves events out."""
+    """Weight of the event loss; 0 leaves events out."""
     pairs: int = 4096
-    """Pairs of successive events drawn per step."""
+    """Pairs of successive events per step."""
     threshold: tuple[float, float] | None = None
-    """Contrast threshold to darker and to brighter; None takes what the capture notes, or 0.2."""
-    rate: float | None = None
-    """First learning rate of response and thresholds; None for that of everything."""
+    """Contrast threshold to darker and to brighter, natural log; None takes that of the capture,
+    or 0.2."""
+    lr: float | None = None
+    """First learning rate of response and thresholds; None takes `lr`."""
     learn_threshold: bool = False
-    """Refine one threshold for each sign (with frames only: events alone cannot tell)."""
+    """Learn one threshold for each polarity; needs frames, as events leave their scale open."""
     response: Literal["linear", "gamma", "learned", "residual"] = "learned"
-    """What events take the logarithm of: linear light, display values, the published learned curve
-    (sigmoid of light plus a network), or log light plus a learned residual that starts at zero."""
+    """Response of event pixels, whose logarithm events compare: `linear` light; `gamma` display values;
+    `learned`, the published curve (sigmoid of light plus a network); `residual`, log light plus a
+    learned function of it that starts at zero."""
     polarity: bool = True
-    """A learned response also reads the signs of the pair's events."""
+    """Whether a learned response also takes the polarities of the pair as inputs."""
     response_from: int = 1200
     """Iteration from which a learned response is used; linear light before."""
     colour: bool = True
-    """On a colour sensor, an event speaks of its own channel only; otherwise of luma."""
+    """Whether events behind a colour filter are compared with their own channel; else with luma."""
     colour_from: int = 1200
-    """Iteration after which channels are weighed 0.4, 0.2, 0.4."""
+    """Iteration after which the channels are weighted 0.4, 0.2, 0.4."""
     accumulate: tuple[int, int] = (0, 0)
-    """Fewest and most events a pair spans; (0, 0) takes successive events."""
+    """Least and largest number of events that a pair spans; (0, 0) takes successive events."""
     half_pixel: bool = True
-    """Rectified positions count from pixel centres; the released code takes them from corners."""
+    """Whether rectified positions are measured from pixel centres; the released code measures from
+    corners."""
 
 
 class EventTerm(nn.Module):
@@ -85,7 +88,7 @@ class EventTerm(nn.Module):
         return None
 
     def draw(self, step: int, device: torch.device) -> EventPairs:
-        """The pairs of a step."""
+        """Random pairs of events of a step."""
         seen = draw_pairs(
             self.table,
             self.options.pairs,
@@ -97,7 +100,7 @@ class EventTerm(nn.Module):
         return seen if self.coloured else _mono(seen)
 
     def sensor(self, step: int) -> LogContrast:
-        """The event sensor as this step sees it."""
+        """The event sensor with the response of a step."""
         late = self.learned is not None and step + 1 >= self.options.response_from
         response = self.learned if late and self.learned is not None else self.early
         return LogContrast(self.camera, self.path, response)
@@ -109,7 +112,7 @@ class EventTerm(nn.Module):
     def error(
         self, predicted: Float[Tensor, "b 1"], seen: EventPairs, step: int
     ) -> Float[Tensor, ""]:
-        """Mean squared error of the change of log intensity."""
+        """Mean squared error of the change of log intensity (Ev-DeblurNeRF, event loss)."""
         weigh = self.coloured and step + 1 > self.options.colour_from
         return contrast_error(
             predicted,
@@ -119,14 +122,14 @@ class EventTerm(nn.Module):
         )
 
     def prior(self) -> Float[Tensor, ""] | None:
-        """What keeps learned thresholds near their guess; None if they are fixed."""
+        """Penalty of learned thresholds far from their first values; None if they are fixed."""
         return self.thresholds.prior() if isinstance(self.thresholds, LearnedThresholds) else None
 
     def groups(self, rate: Schedule) -> list[Group]:
-        """Parameters of the response and of the thresholds."""
+        """Parameters of response and thresholds with their learning rate."""
         return [Group("response", own, rate)] if (own := tuple(self.parameters())) else []
 
 
 def _mono(seen: EventPairs) -> EventPairs:
-    """The same pairs as a sensor without a colour filter reports them."""
+    """The same pairs without colour channels."""
     return replace(seen, channel=None)

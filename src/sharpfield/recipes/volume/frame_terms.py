@@ -1,6 +1,6 @@
-"""The frame terms shared by recipes: blur learned for each image, or along the known motion.
+"""The frame terms of the volume recipes: learned blur kernels, or blur along the known motion.
 
-Sharp images from the event double integral, as targets for single rays.
+The EDI prior: sharp images from the event double integral as targets of single rays.
 """
 
 from dataclasses import dataclass
@@ -29,20 +29,21 @@ from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """EDI images as targets. Defaults: Ev-DeblurNeRF's synthetic recipe."""
+    """The EDI prior. Defaults: Ev-DeblurNeRF's synthetic recipe."""
 
     weight: float = 0.01
-    """Of the term at the first step; 0 leaves it out."""
-    end: float = 1e-5
-    """Of the term from step `until` on."""
+    """Weight of the prior at the first step; 0 leaves it out."""
+    final_weight: float = 1e-5
+    """Weight of the prior from step `until` on."""
     until: int = 10_000
-    """The weight falls along half a cosine until this step."""
+    """Step until which the weight falls along half a cosine."""
     domain: Literal["display", "linear"] = "display"
-    """The released code integrates stored values, in eight slices; light adds up in linear."""
+    """What the event double integral averages: stored values in eight slices (`display`, as
+    released), or linear light."""
 
 
 class MiddlePrior(nn.Module):
-    """A sharp image of each frame at the middle of its exposure, as published."""
+    """EDI images of each frame at the middle of its exposure, as published."""
 
     images: Tensor
 
@@ -66,13 +67,13 @@ class MiddlePrior(nn.Module):
         self.register_buffer("images", images, persistent=False)
 
     def target(self, seen: Pixels) -> Float[Tensor, "b c"]:
-        """Stored value a sharp pixel would have; the published one is not clipped."""
+        """Stored values of sharp pixels; the published ones are not clipped."""
         x, y = seen.xy.long().unbind(-1)
         return self.images[seen.frame, y, x]
 
 
 class InstantsPrior(nn.Module):
-    """Sharp light at several instants of each exposure, exact and in linear light."""
+    """EDI images at several instants of each exposure, exact and in linear light."""
 
     ratio: Tensor
 
@@ -93,7 +94,7 @@ class InstantsPrior(nn.Module):
         self.tone = tone_of(frames.encoding)
 
     def target(self, seen: Pixels) -> Float[Tensor, "b k c"]:
-        """Stored values a sharp pixel would have at each instant."""
+        """Stored values of sharp pixels at each instant."""
         x, y = seen.xy.long().unbind(-1)
         ratio = self.ratio[seen.frame, :, y, x].float()
         light = self.tone.decode(seen.value)[:, None] * ratio
@@ -105,31 +106,31 @@ Terms = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """How frames are explained. Defaults: Ev-DeblurNeRF's synthetic recipe."""
+    """The frame losses. Defaults: Ev-DeblurNeRF's synthetic recipe."""
 
     blur: Literal["kernel", "motion", "none", "auto"] = "kernel"
-    """Blur as a learned kernel per image, as the mean along the known motion, or not at all; auto
-    takes the motion where exposures are known."""
+    """Model of blur: `kernel`, learned for each image; `motion`, the mean along the known camera
+    motion; `none`; `auto` takes `motion` where it is known, else `kernel`."""
     pixels: int = 1024
-    """Drawn per step while each has a single ray; 0 leaves frames out."""
+    """Pixels per step with a single ray each; 0 leaves frames out."""
     blurred_pixels: int = 1024
-    """Drawn per step once each has several rays."""
+    """Pixels per step once each has several rays."""
     instants: int = 9
-    """Instants of an exposure, with `motion`."""
+    """Instants of an exposure that are averaged, with `motion`."""
     blur_from: int = 1200
     """Iteration from which blur is modelled."""
     frames_from: int = 1
-    """Iteration from which frames count; without a prior they count from the first."""
+    """Iteration from which the loss of frames counts; without a prior from the first."""
 
 
 class FrameTerm(nn.Module):
-    """What all frame terms share: which pixels a step looks at, and through which lens.
+    """What all frame terms share: random pixels, and their rays.
 
     Args:
-        options: Counts and beginnings.
-        volume: The sharp scene.
-        tone: Light to stored values.
-        prior_weight: Of the sharp images from events, by step.
+        options: Numbers of pixels, and first iterations.
+        volume: The static scene.
+        tone: Linear light to stored values.
+        prior_weight: Weight of the EDI prior by step.
     """
 
     def __init__(
@@ -146,18 +147,18 @@ class FrameTerm(nn.Module):
         return self.options.blur != "none" and step + 1 >= self.options.blur_from
 
     def draw(self, step: int, device: torch.device) -> Pixels:
-        """The pixels of a step."""
+        """Random pixels of a step."""
         options = self.options
         count = options.blurred_pixels if self.blurred(step) else options.pixels
         return draw_pixels(self.table, count, seed=self.seed, step=step, device=device)
 
     def stored_error(self, light: Radiance, target: Float[Tensor, "*b c"]) -> Float[Tensor, ""]:
-        """Mean squared error of each ray's stored value, fine and coarse."""
+        """Mean squared error of the stored value of each ray, fine and coarse."""
         return torch.stack([mse(self.tone(stage.rgb), target) for stage in stages(light)]).sum()
 
 
 class KernelTerm(FrameTerm):
-    """Blur learned for each image, as published: single rays first, then the kernel."""
+    """Kernels learned for each image, as published: single rays first, then the kernel."""
 
     def __init__(
         self,
@@ -167,15 +168,15 @@ class KernelTerm(FrameTerm):
         prior_weight: Schedule,
         *,
         blur: LearnedBlur | None,
-        trusted: Schedule,
+        share: Schedule,
         prior: MiddlePrior | None,
     ) -> None:
         super().__init__(options, volume, tone, prior_weight)
-        self.blur, self.trusted, self.prior = blur, trusted, prior
+        self.blur, self.share, self.prior = blur, share, prior
         self.frames_from = options.frames_from if prior is not None else 1
 
     def terms(self, volume: Volume, seen: Pixels, step: int) -> Terms:
-        """Error of the blurred pixels, and of their unmoved rays against the prior."""
+        """Squared errors of blurred pixels, and of their unmoved rays against the EDI prior."""
         iteration = step + 1
         counts = iteration >= self.frames_from
         if self.blur is None or not self.blurred(step):
@@ -185,7 +186,7 @@ class KernelTerm(FrameTerm):
             light = volume.sharp(
                 self.blur.expose(seen), step, "frames", samples=self.blur.adaptive is not None
             )
-            terms = self.blur.losses(light, seen, trusted=self.trusted(iteration), rigid=counts)
+            terms = self.blur.losses(light, seen, share=self.share(iteration), rigid=counts)
         if self.prior is not None:
             error = self.stored_error(light[:, 0], self.prior.target(seen))
             terms["prior"] = self.prior_weight(step) * error
@@ -193,10 +194,10 @@ class KernelTerm(FrameTerm):
 
 
 class MotionTerm(FrameTerm):
-    """Blur as the mean along the known motion, with sharp images at every instant of it.
+    """Blur as the mean along the known motion, with EDI targets at every instant.
 
-    Before blur is modelled, each pixel is asked at one instant of its exposure alone, which costs
-    a single ray; the sharp images from events say what it should be.
+    Before blur is modelled, each pixel is rendered at one random instant of its exposure, a single
+    ray, and compared with the EDI image of that instant.
     """
 
     def __init__(
@@ -214,7 +215,7 @@ class MotionTerm(FrameTerm):
         self.shutter = Shutter(capture.camera, capture.trajectory, options.instants, tone)
 
     def blurred(self, step: int) -> bool:
-        """Without sharp images there is nothing to learn from before blur is modelled."""
+        """Whether this step models blur; without EDI images always."""
         return self.prior is None or super().blurred(step)
 
     def terms(self, volume: Volume, seen: Pixels, step: int) -> Terms:

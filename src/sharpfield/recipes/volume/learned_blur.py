@@ -1,4 +1,4 @@
-"""Blur whose motion is learned for each image: the rigid kernel with adaptive weights."""
+"""Learned blur kernels: rigid motions for each image, with adaptive weights for each pixel."""
 
 from dataclasses import dataclass
 
@@ -23,30 +23,31 @@ class KernelOptions:
     """The rigid blurring kernel of Ev-DeblurNeRF (CVPR 2024) and DP-NeRF (CVPR 2023)."""
 
     motions: int = 9
-    """Learned rigid motions per image; the unmoved ray comes on top."""
-    rate: float | None = None
-    """First learning rate of kernel and adaptive network; None for that of everything."""
+    """Learned rigid motions per image, besides the unmoved ray."""
+    lr: float | None = None
+    """First learning rate of kernel and adaptive network; None takes `lr`."""
     adaptive: bool = True
-    """A network proposes other weights for each pixel, from the features along its rays."""
+    """Whether a network predicts weights for each pixel from the features along its rays."""
     integration: Integration = "channels"
-    """`channels` is the released rule of the adaptive network, `samples` the intended one."""
+    """Integration of features by the adaptive network: over `channels`, as released, or over
+    `samples`, as intended."""
     norm: Norm = "batch"
-    """Normalisation inside the adaptive network: batch (released) or layer."""
-    trust: tuple[float, float] = (0.1, 0.9)
-    """Share of the adaptive weights in the loss, when the kernel begins and at the end."""
-    trust_every: int = 10_000
+    """Normalisation in the adaptive network: batch (released) or layer."""
+    adaptive_share: tuple[float, float] = (0.1, 0.9)
+    """Share of the adaptive weights in the loss at the first blurred iteration and at the end."""
+    adaptive_share_every: int = 10_000
     """Iterations between updates of that share."""
 
 
-def trust(options: KernelOptions, *, begin: int, steps: int) -> Schedule:
-    """Share of the adaptive weights: geometric from begin to end, in the released staircase.
+def share_of_adaptive(options: KernelOptions, *, begin: int, steps: int) -> Schedule:
+    """Schedule of the share of adaptive weights: geometric, in the released staircase.
 
     A function of the iteration, which counts from 1.
     """
-    first, last = options.trust
+    first, last = options.adaptive_share
 
     def at(iteration: int) -> float:
-        stair = iteration // options.trust_every * options.trust_every
+        stair = iteration // options.adaptive_share_every * options.adaptive_share_every
         part = max(stair - begin, 0) / (steps + 1 - begin)
         return first * (last / first) ** part
 
@@ -54,7 +55,7 @@ def trust(options: KernelOptions, *, begin: int, steps: int) -> Schedule:
 
 
 class LearnedBlur(nn.Module):
-    """Rays and losses of blurred pixels under a learned kernel."""
+    """Rays and losses of blurred pixels with a learned kernel."""
 
     def __init__(
         self, options: KernelOptions, capture: Capture, tone: Curve, *, features: int, seed: int
@@ -77,29 +78,29 @@ class LearnedBlur(nn.Module):
         )
 
     def expose(self, seen: Pixels) -> Rays:
-        """The origin and the moved rays."""
+        """The unmoved ray and the moved rays of each pixel."""
         return self.kernel.expose(seen)
 
     def losses(
-        self, light: Radiance, seen: Pixels, *, trusted: float, rigid: bool
+        self, light: Radiance, seen: Pixels, *, share: float, rigid: bool
     ) -> dict[str, Float[Tensor, ""]]:
-        """Errors under the rigid weights and under the adaptive ones.
+        """Squared errors with the rigid weights and with the adaptive ones.
 
         Args:
-            light: Of the exposed rays, with samples if weights are adaptive.
-            seen: What the frames say.
-            trusted: Share of the adaptive weights.
-            rigid: Whether the rigid term counts already.
+            light: Radiance of the exposed rays, with samples if weights are adaptive.
+            seen: Pixels of the frames.
+            share: Share of the adaptive weights in the loss.
+            rigid: Whether the rigid term is part of the loss yet.
         """
         terms: dict[str, Tensor] = {}
         if self.adaptive is None:
-            trusted = 0.0
+            share = 0.0
         if rigid:
-            terms["blur"] = (1 - trusted) * self._error(light, seen)
+            terms["blur"] = (1 - share) * self._error(light, seen)
         if self.adaptive is not None and light.samples is not None:
             weight = self.adaptive(light.samples, self.motions.codes(seen.frame))
             mixed = Radiance(light.rgb, light.depth, light.opacity, weight)
-            terms["adaptive"] = trusted * mse(self.kernel.observe(mixed, seen), seen.value)
+            terms["adaptive"] = share * mse(self.kernel.observe(mixed, seen), seen.value)
         return terms
 
     def _error(self, light: Radiance, seen: Pixels) -> Float[Tensor, ""]:

@@ -1,4 +1,4 @@
-"""The sharp scene of the volumetric recipes: a capture in its own space, a field, a renderer."""
+"""The static scene of the volume recipes: a normalised capture, a radiance field, a renderer."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -25,47 +25,48 @@ from sharpfield.rendering.head_compositing import Compositing
 from sharpfield.rendering.voxels import EvenSteps
 
 MOST_CELLS = 4_000_000
-"""Cells of a dense grid that sizes itself; each costs 64 bytes with its gradient and moments."""
+"""Most voxels of a dense grid of automatic size; each takes 64 bytes with gradient and moments."""
 
 
 @dataclass(frozen=True)
 class VolumeOptions:
-    """The field, and how rays sample it. Defaults: Ev-DeblurNeRF (CVPR 2024)."""
+    """The radiance field, and its samples on rays. Defaults: Ev-DeblurNeRF (CVPR 2024)."""
 
     kind: Literal["planes", "mlp", "voxels"] = "planes"
-    """Factored feature volumes with small networks, NeRF's large networks alone, or a dense grid of
-    density and colour without any network."""
+    """`planes`: factored feature volumes with small networks; `mlp`: the networks of NeRF;
+    `voxels`: a dense grid of density and colour without any network."""
     voxels: tuple[int, int] = (16_777_248, 134_217_984)
-    """Resolution of the coarse and the fine volume: about 256^3 and 512^3. A dense grid has the
-    second; 0 gives it about a cell for each pixel and step."""
+    """Number of voxels of the coarse and the fine volume: about 256^3 and 512^3. A dense grid has
+    the second; 0 gives it about one voxel per pixel and sample."""
     channels: tuple[int, int, int] = (64, 16, 16)
-    """Features of the xy, xz and yz planes."""
+    """Feature channels of the xy, xz and yz planes."""
     coarse: tuple[int, int, int] = (64, 15, 64)
     """Coarse head: hidden width, features, width of the colour layers."""
     fine: tuple[int, int, int] = (256, 128, 256)
-    """Fine head."""
+    """Fine head: hidden width, features, width of the colour layers."""
     octaves: tuple[int, int] = (10, 4)
-    """Frequencies in the encoding of position and of direction."""
+    """Frequencies of the positional encoding of positions and of directions."""
     samples: tuple[int, int] = (64, 64)
-    """Coarse points on a ray, and fine points added to them. A dense grid takes as many steps as
-    both together."""
+    """Coarse samples on a ray, and fine samples added to them. A dense grid takes the sum of both
+    in even steps."""
     noise: float = 1.0
     """Standard deviation of the noise on raw density while training."""
     density: Literal["relu", "softplus"] = "relu"
-    """From raw density to density."""
+    """Activation of the density."""
     space: Literal["auto", "ndc", "metric"] = "auto"
-    """Normalised device coordinates, or plain distance; auto takes the first if all cameras look
-    roughly the same way."""
+    """`ndc`: normalised device coordinates; `metric`: distance along the ray; `auto` takes `ndc`
+    for forward-facing captures."""
     background: float = 0.0
-    """Light from behind a metric space, 0 black to 1 white."""
+    """Linear light behind a metric space, 0 black to 1 white."""
     clear_before: float = 0.0
-    """In evaluation, nothing is seen up to this ray parameter (0...1); hides floaters."""
+    """In evaluation, density is zero up to this ray parameter (0...1), which hides floaters near
+    the camera."""
     precision: Literal["float32", "bfloat16", "auto"] = "float32"
-    """What the heads compute in; auto takes bfloat16 where the CPU has it."""
+    """Precision of the heads; `auto` takes bfloat16 where the device has it."""
 
 
 GRID_RATE = 0.2
-"""Learning rate of a dense grid, whose cells are density and colour themselves."""
+"""First learning rate of a dense grid, whose voxels are density and colour themselves."""
 DRAFT: dict[str, Any] = {"kind": "voxels", "voxels": (0, 0), "samples": (96, 0), "noise": 0.0}
 """Changes to `VolumeOptions` for minutes on a CPU."""
 STANDARD: dict[str, Any] = {
@@ -81,7 +82,7 @@ STANDARD: dict[str, Any] = {
 
 
 def soft(raw: torch.Tensor) -> torch.Tensor:
-    """A smooth density that starts thin, so that rays see through an untrained scene."""
+    """Shifted softplus: density starts low, so that rays pass through an untrained scene."""
     return nn.functional.softplus(raw - 1)
 
 
@@ -89,12 +90,12 @@ ACTIVATIONS = {"relu": torch.relu, "softplus": soft}
 
 
 class Volume(nn.Module):
-    """A sharp scene and the capture it explains, in the same normalised space.
+    """A static radiance field and its capture, in the same normalised space.
 
     Args:
         options: Sizes and sampling.
         capture: As read.
-        seed: Of the run.
+        seed: Random seed of the run.
     """
 
     def __init__(self, options: VolumeOptions, capture: Capture, seed: int) -> None:
@@ -121,17 +122,17 @@ class Volume(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     @property
     def feature_width(self) -> int:
-        """Width of the features along rays; 0 if there are none."""
+        """Width of the features of samples; 0 if there are none."""
         widths = {"planes": self.options.fine[1], "mlp": 256, "voxels": 0}
         return widths[self.options.kind]
 
     def sharp(self, rays: Rays, step: int, stream: str, *, samples: bool = False) -> Radiance:
-        """Light along rays while training: jittered and noisy, by seed, step and stream."""
+        """Training radiance along rays: jittered samples and noise, by seed, step and stream."""
         made = generator(self.seed, step, stream, self.device)
         return self.train_view(rays, made, samples=samples)
 
@@ -144,7 +145,7 @@ class Volume(nn.Module):
         return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
 
     def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
-        """Parameters of the networks and of the grids."""
+        """Parameters of networks and grids with their learning rates."""
         if isinstance(self.field, VoxelField):
             grids: tuple[nn.Parameter, ...] = tuple(self.field.static)
         else:
@@ -156,7 +157,7 @@ class Volume(nn.Module):
 
 
 def stages(light: Radiance) -> list[Radiance]:
-    """The light as the fine stage sees it, and as the coarse one does where there are two."""
+    """The radiance of the fine stage, then that of the coarse one if there are two."""
     return [light] if light.coarse is None else [light, light.coarse]
 
 
@@ -189,7 +190,7 @@ def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space
 
 
 def _seen_from(capture: Capture, poses: Float[np.ndarray, "n 3 4"]) -> Float[Tensor, "m 3 4"]:
-    """The poses that the scene box holds the views of: the frames', or those given without any."""
+    """Poses whose views the scene box must hold: those of the frames, or the given ones."""
     if capture.frames is None:
         return torch.as_tensor(poses).float()
     return capture.frame_pose(np.arange(len(capture.frames)))

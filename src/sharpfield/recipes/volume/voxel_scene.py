@@ -1,6 +1,7 @@
-"""A moving scene of the recipes without networks: a capture around its middle, a field, a renderer.
+"""A dynamic scene on voxels: a centred capture, static and moving voxel grids, a renderer.
 
-Its terms ask for what events leave open: what moves is smooth, in space and in time.
+Regularisers settle what events leave open: moving voxels are smooth in space and in time, and empty
+space is transparent.
 """
 
 from dataclasses import dataclass, field
@@ -20,8 +21,8 @@ from sharpfield.initialisation.visual_hull import visual_hull
 from sharpfield.ops.voxel_march import DENSITY_SHIFT
 from sharpfield.rendering.voxels import BoxSteps
 
-FOG_POINTS = 2048
-"""Points that are asked for fog in each step."""
+PENALTY_POINTS = 2048
+"""Random points of the density penalty in each step."""
 
 DENSE = 10.0
 """Steepness of the logarithm: a tenth of an e-fold in a step is dense."""
@@ -29,33 +30,33 @@ DENSE = 10.0
 
 @dataclass(frozen=True)
 class MovingOptions:
-    """The field, and how rays sample it."""
+    """The voxel grids, and their samples on rays."""
 
     size: VoxelSizes = field(default_factory=VoxelSizes)
-    steps: int = 64
-    """Of a ray from side to side of the box."""
-    clear: float = -3.0
-    """First raw density of what stands still: nearly empty, as events do not say what is there."""
+    samples: int = 64
+    """Samples of a ray from side to side of the box."""
+    static_density: float = -3.0
+    """First raw density of the static grid: nearly empty, as events do not show static parts."""
     hull: bool = True
-    """Voxels move only where and when every camera that stands still sees something move."""
-    solid: float = 6.0
-    """First raw density of what moves, where they do: nearly opaque."""
-    empty: float = 3.0
-    """Weight of how dense the box is: what nothing speaks for stays empty."""
-    smooth: float = 0.1
-    """Weight of the total variation in space of what moves."""
-    steady: float = 1e-3
-    """Weight of its change from moment to moment."""
+    """Use the visual hull: voxels move only where and when every static camera sees motion."""
+    moving_density: float = 6.0
+    """First raw density of the moving grid inside the hull: nearly opaque."""
+    density_weight: float = 3.0
+    """Weight of the density penalty at random points of the box."""
+    tv_weight: float = 0.1
+    """Weight of the total variation in space of the moving grid."""
+    time_tv_weight: float = 1e-3
+    """Weight of the total variation in time of the moving grid."""
 
 
 class MovingScene(nn.Module):
-    """A sharp moving scene and the capture it explains, in a box around what the cameras look at.
+    """A dynamic scene and its capture, in a box around the point that the cameras look at.
 
     Args:
         options: Sizes and sampling.
         capture: As read.
-        seed: Of the run.
-        index: Of the capture's events, if they may say where something moves.
+        seed: Random seed of the run.
+        index: Index of the capture's events, for the visual hull.
     """
 
     def __init__(
@@ -72,24 +73,24 @@ class MovingScene(nn.Module):
         self.field = VoxelField(
             static_shapes(options.size),
             occupied or [torch.ones(moments, n, n, n).bool() for moments, n in shapes],
-            raw_density=options.clear,
+            raw_density=options.static_density,
             background=True,
         )
         if hulls and hulls[0] is not None:
-            self.field.fill(hulls[0].solid, options.solid)
-        self.view = BoxSteps(self.field, step=2 / options.steps)
+            self.field.fill(hulls[0].solid, options.moving_density)
+        self.view = BoxSteps(self.field, step=2 / options.samples)
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return self.field.static[0].device
 
     def sharp(self, rays: Rays, step: int, stream: str) -> Radiance:
-        """Light along rays while training: jittered by seed, step and stream."""
+        """Training radiance along rays: jittered samples, by seed, step and stream."""
         return self.view(rays, generator(self.seed, step, stream, self.device))
 
-    def roughness(self, step: int) -> Tensor:
-        """How rough what moves is in space, and how much it changes, at one random moment."""
+    def total_variation(self, step: int) -> Tensor:
+        """Total variation of the moving grid in space and in time, at one random moment."""
         random = generator(self.seed, step, "moment")
         last = len(self.field.rows[0]) - 1
         moment = int(torch.randint(last, (), generator=random))
@@ -101,22 +102,22 @@ class MovingScene(nn.Module):
             return (part.diff(dim=axis).square() * both).sum() / both.sum().clamp_min(1) / 4
 
         across = torch.stack([changed(axis) for axis in (1, 2, 3)]).sum()
-        return self.options.smooth * across + self.options.steady * changed(0)
+        return self.options.tv_weight * across + self.options.time_tv_weight * changed(0)
 
-    def fog(self, step: int) -> Tensor:
-        """How dense the box is at random points, at one random moment.
+    def density_penalty(self, step: int) -> Tensor:
+        """Density penalty at random points of the box, at one random moment.
 
-        The logarithm lets surfaces be as dense as they like (Plenoxels, CVPR 2022).
+        The logarithm leaves surfaces free to be dense (Plenoxels, CVPR 2022).
         """
         random = generator(self.seed, step, "fog")
-        points = 2 * torch.rand(FOG_POINTS, 3, generator=random) - 1
+        points = 2 * torch.rand(PENALTY_POINTS, 3, generator=random) - 1
         time = float(torch.rand((), generator=random))
         raw = self.field.raw_density(points.to(self.device), time)
         return (
-            self.options.empty
+            self.options.density_weight
             * torch.log1p(DENSE * functional.softplus(raw + DENSITY_SHIFT)).mean()
         )
 
     def groups(self, rate: Schedule) -> list[Group]:
-        """Voxels and background."""
+        """Parameters of voxels and background with their learning rate."""
         return [Group("voxels", tuple(self.field.parameters()), rate)]

@@ -1,4 +1,4 @@
-"""The scene of D-NeRF: a canonical network and one that says where points have moved from.
+"""The scene of D-NeRF: a canonical radiance field and a deformation field.
 
 A. Pumarola et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021, as EvDNeRF (WACV
 2024) uses it.
@@ -31,38 +31,37 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @dataclass(frozen=True)
 class WarpedOptions:
-    """The networks, and how rays sample them. Defaults: the released code of EvDNeRF."""
+    """The networks, and their samples on rays. Defaults: the released code of EvDNeRF."""
 
     width: int = 256
-    """Of all layers."""
+    """Width of all layers."""
     depth: int = 8
-    """Layers of each network."""
+    """Number of layers of each network."""
     networks: int = 1
-    """Canonical networks: one that is both coarse and fine, or two."""
+    """Canonical networks: 1 for both stages, or 2, a coarse and a fine one."""
     colours: int = 1
-    """1 for grey, 3 for colour."""
+    """Channels: 1 for grey, 3 for colour."""
     samples: tuple[int, int] = (64, 128)
-    """Coarse points on a ray, and fine points added to them."""
+    """Coarse samples on a ray, and fine samples added to them."""
     density: Literal["sigmoid", "relu", "softplus"] = "sigmoid"
-    """From raw density to density for a unit of length. The released sigmoid never exceeds 1, so
+    """Activation of the density per unit of length. The released sigmoid never exceeds 1, so
     that a wall half a unit thick lets 61 % through."""
     opaque_end: bool = True
-    """The last point of a ray stops all light and has a colour of its own at any time (released);
-    else there is black behind."""
+    """Whether the last sample of a ray is opaque (released); else the background is black."""
     at_zero: AtZero = "exactly"
-    """How the canonical scene is that of time 0."""
+    """How the deformation vanishes at time 0, where the scene is the canonical one."""
     shared_jitter: bool = False
-    """Both instants of a window are sampled with the same random numbers; released: independent
-    ones, so that even what stands still changes."""
+    """Whether both instants of a window have the same jitter; released: independent jitter, so that
+    even static parts change."""
 
 
 class WarpedScene(nn.Module):
-    """A moving scene in the capture's own world and units.
+    """A dynamic scene in the world and units of the capture.
 
     Args:
         options: Sizes and sampling.
         capture: As read.
-        seed: Of the run.
+        seed: Random seed of the run.
     """
 
     def __init__(self, options: WarpedOptions, capture: Capture, seed: int) -> None:
@@ -87,11 +86,11 @@ class WarpedScene(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     def sharp(self, rays: Rays, step: int, stream: str) -> Radiance:
-        """Light along rays `[b, k]` while training: jittered by seed, step and stream."""
+        """Training radiance along rays `[b, k]`: jittered samples, by seed, step and stream."""
         made = generator(self.seed, step, stream, self.device)
         if not self.options.shared_jitter:
             return self.view(rays, made)
@@ -103,7 +102,7 @@ class WarpedScene(nn.Module):
         return joined(parts)
 
     def groups(self, rate: Schedule) -> list[Group]:
-        """All networks."""
+        """Parameters of all networks with their learning rate."""
         return [Group("networks", tuple(self.parameters()), rate)]
 
 
