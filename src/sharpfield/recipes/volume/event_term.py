@@ -38,7 +38,7 @@ class EventOptions:
     learn_threshold: bool = False
     """Learn one threshold for each polarity; needs frames, as events leave their scale open."""
     response: Literal["linear", "gamma", "learned", "residual"] = "learned"
-    """Response of event pixels, whose logarithm events compare: `linear` light; `gamma` display values;
+    """Response of event pixels, before the logarithm: `linear` light; `gamma`, display values;
     `learned`, the published curve (sigmoid of light plus a network); `residual`, log light plus a
     learned function of it that starts at zero."""
     polarity: bool = True
