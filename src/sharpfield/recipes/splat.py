@@ -20,7 +20,6 @@ from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.splats import papers
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
-from sharpfield.recipes.splats.renamed import RENAMED, RENAMED_MOVING
 from sharpfield.recipes.splats.scene import GaussianOptions, MotionOptions
 from sharpfield.sampling.views import SamplingOptions
 
@@ -28,6 +27,45 @@ R = TypeVar("R", bound="Splat")
 
 REFINED_KNOTS = 48
 """Knots of a refined trajectory."""
+
+_MOVING = {
+    "looks.still": "motion.static_warmup",
+    "looks.alone": "sampling.event_only_weight",
+    "gaussians.density_moving": "motion.density",
+    "gaussians.span_ms": "motion.lifespan_ms",
+    "gaussians.idle_moving": "motion.reg",
+    "gaussians.fleeting": "motion.lifespan_penalty",
+    "gaussians.spans_rate": "motion.lifespan_lr",
+}
+
+RENAMED = {
+    "looks.instants": "sampling.grad_views",
+    "looks.draws": "sampling.views",
+    "looks.early": "sampling.edi_phase",
+    "looks.still": "sampling.sharp_warmup",
+    "looks.sharp": "sampling.latent_weight",
+    "looks.windows": "sampling.event_weight",
+    "looks.fading": "sampling.final_event_weight",
+    "looks.shortest_us": "sampling.min_window_us",
+    "looks.longest_us": "sampling.max_window_us",
+    "looks.depth": "sampling.depth_weight",
+    "looks.quality": "sampling.frame_quality",
+    "looks.part": "sampling.crop",
+    "looks": "sampling",
+    "unknowns.rate": "calibration.lr",
+    "unknowns.poses_rate": "calibration.poses_lr",
+    "unknowns.offset_rate_us": "calibration.offset_lr_us",
+    "unknowns": "calibration",
+    "gaussians.budget": "gaussians.cap_max",
+    "gaussians.degree": "gaussians.sh_degree",
+    "gaussians.size": "gaussians.scale",
+    "gaussians.idle": "gaussians.reg",
+    "gaussians.rates": "gaussians.lr",
+}
+"""Former names of options, for hints; single options come before their group: the first counts."""
+
+RENAMED_MOVING = _MOVING | {old: new for old, new in RENAMED.items() if old not in _MOVING}
+"""The same of recipes for moving scenes."""
 
 
 def refine(recipe: R) -> R:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from sharpfield.captures.blocks import blocks_of
 from sharpfield.core.capture import Capture
-from sharpfield.recipes.splats.merge import merge
+from sharpfield.recipes.splats.model import merge_blocks
 from sharpfield.runs.config import RunConfig, read_run_config, write_run_config
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import train_run
@@ -112,7 +112,7 @@ def _up_to_date(runs: BlockRuns, together: TrainingStatus) -> bool:
 def _merge(runs: BlockRuns, capture: Capture, together: TrainingStatus) -> None:
     """Write the merged run: what all processes that get here write is the same."""
     models = [open_run(run, device="cpu").model for run in runs.folders()]
-    merged: Any = merge(models, blocks_of(capture, runs.count))
+    merged: Any = merge_blocks(models, blocks_of(capture, runs.count))
     write_run_config(runs.out, runs.whole)
     progress = TrainingProgress(together.steps, together.steps, settings=runs.whole.settings())
     save_last(runs.out, merged, adam(merged), progress)

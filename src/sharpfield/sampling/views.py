@@ -3,7 +3,7 @@
 A batch holds the *instants* whose views a step renders, for each of its cameras, and what was
 measured of them: the blurred frame of an exposure, *latent frames* (sharp images by the event
 double integral), and *windows*: the events counted at every pixel from one instant to the next.
-All cameras of a batch look at the same instants, so that moving Gaussians are placed once for all.
+All cameras of a batch share its instants, so that moving Gaussians are evaluated once for all.
 A *crop* of the image makes a step cheaper.
 """
 
@@ -35,7 +35,7 @@ class SamplingOptions:
     """`none` takes frames as sharp; `motion` as the mean of light along the motion of the camera:
     the capture's own, or one learned for each frame where it is not known."""
     cameras: int = 1
-    """Most cameras of one step; all at the same instants."""
+    """Maximum number of cameras in one step; all at the same instants."""
     views: int = 9
     """Views over an exposure whose mean is compared with the blurred frame; rounded up to a
     multiple of `grad_views`."""
@@ -43,10 +43,10 @@ class SamplingOptions:
     """How many of them the scene learns through; the others are rendered without gradient. Also
     the views of a batch of events alone."""
     edi_phase: float = 0.6
-    """Part of the schedule that compares latent frames at single instants, where events give
+    """Fraction of the schedule that compares latent frames at single instants, where events give
     them."""
     sharp_warmup: float = 0.0
-    """Part of the schedule that takes frames as if they were sharp: one view instead of several."""
+    """Fraction of the schedule that takes frames as sharp: one view instead of several."""
     latent_weight: float = 0.05
     """Weight of latent frames beside a blurred frame; alone it is 1. 0 makes none."""
     latent_pairs: bool = False
@@ -62,13 +62,13 @@ class SamplingOptions:
     and late in the dark, and no two pixels have the same threshold: in the end, blurred frames are
     nearer the truth."""
     min_window_us: int = 2_000
-    """Least length of a window that begins or ends outside an exposure."""
+    """Shortest window that begins or ends outside an exposure, in us."""
     max_window_us: int = 50_000
-    """Most length of all windows of a batch of events alone."""
+    """Longest time that the windows of a batch of events alone span, in us."""
     depth_weight: float = 0.0
     """Weight of measured depth, after the EDI phase."""
     frame_quality: Literal["even", "auto", "images", "events"] = "even"
-    """Which frames are drawn more often: none; those that events, or else images, show to be
+    """Which frames are sampled more often: none; those that events, or else images, show to be
     sharp; those that look sharp; those with few events during the exposure."""
     crop: int = 0
     """Side of the square crop of the image that a step renders, in pixels; 0 takes the image."""
@@ -88,7 +88,7 @@ class ViewSampler:
         capture: In the model's space; events of a rolling shutter on the clock of its first row.
         seed: Of the run.
         steps: Length of the schedule.
-        weights: How often each training frame is drawn; all alike by default.
+        weights: How often each training frame is sampled; by default, all equally.
         separate_events: Events get steps of their own beside frames. Needed where their clock may
             be late by an unknown time, which views at the frames' instants cannot tell.
     """

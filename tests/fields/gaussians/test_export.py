@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from sharpfield.core.tone import srgb
-from sharpfield.fields.gaussians.export import export_splats, import_splats, moved
+from sharpfield.fields.gaussians.export import export_splats, import_splats, transformed
 from sharpfield.fields.gaussians.static import FLAT, GREY, Gaussians
 from sharpfield.geometry.se3 import rotation_exp
 from sharpfield.geometry.space import Similarity
@@ -50,7 +50,7 @@ def test_in_another_world_everything_looks_the_same():
     scene = made(sh_degree=3)
     turn = rotation_exp(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64)).numpy()
     change = Similarity(2.5, turn, np.array([1.0, -2.0, 0.5]))
-    after = moved(scene, change)
+    after = transformed(scene, change)
     there = torch.from_numpy(change.points(EYE.double().numpy())).float()
     torch.testing.assert_close(after.colours(there), scene.colours(EYE), atol=1e-5, rtol=1e-5)
     shape = lambda g: g.rotations @ torch.diag_embed(g.scales**2) @ g.rotations.mT  # noqa: E731

@@ -1,9 +1,9 @@
-"""Gaussians to and from the files of splat viewers.
+"""Gaussians to and from the .ply files of splat viewers.
 
-Viewers take what a file says as values for the display, and blend those. Our Gaussians hold what
-the frames store, which is that already, or nearly; only where the frames are linear are colours
-written through the sRGB curve: the base exactly, what changes with the direction by the slope of
-the curve there. We blend light and viewers do not, so soft edges come out a little different.
+Viewers treat the colours of a file as display values, and blend those. Our Gaussians hold stored
+values of the frames, which are display values, or nearly; only where the frames are linear, colours
+are converted to sRGB: the base harmonics exactly, the higher ones by the slope of the curve there.
+We blend linear light and viewers do not, so soft edges come out a little different.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ from sharpfield.ops.encoding import spherical_harmonics
 from sharpfield.storage.splat_file import SplatTable, read_splats, write_splats
 
 DIRECTIONS = 64
-"""Along which harmonics are compared to turn them; 16 would do."""
+"""In which spherical harmonics are evaluated to rotate them; 16 would do."""
 
 
 def export_splats(
@@ -32,24 +32,24 @@ def export_splats(
     change: Similarity | None = None,
     comments: tuple[str, ...] = (),
 ) -> None:
-    """Write Gaussians for viewers.
+    """Write Gaussians as a .ply file for splat viewers.
 
     Args:
         gaussians: Of one or three colours.
         path: Ends in .ply.
-        encoding: Of what the Gaussians hold, see `Frames`.
-        change: To another world, e.g. the capture's own; by default none.
-        comments: What else to write into the header.
+        encoding: Of the values that the Gaussians hold, see `Frames`.
+        change: Transform to another world, e.g. the capture's own; by default none.
+        comments: Lines of the header.
     """
-    seen = gaussians if change is None else moved(gaussians, change)
-    harmonics = seen.harmonics.detach().cpu()
+    placed = gaussians if change is None else transformed(gaussians, change)
+    harmonics = placed.harmonics.detach().cpu()
     if encoding == "linear":
-        harmonics = _displayed(harmonics)
+        harmonics = _as_srgb(harmonics)
     table = SplatTable(
-        means=_array(seen.means),
-        quaternions=_array(torch.nn.functional.normalize(seen.quaternions, dim=-1)),
-        log_scales=_array(seen.log_scales),
-        opacity_logits=_array(seen.opacity_logits),
+        means=_array(placed.means),
+        quaternions=_array(torch.nn.functional.normalize(placed.quaternions, dim=-1)),
+        log_scales=_array(placed.log_scales),
+        opacity_logits=_array(placed.opacity_logits),
         harmonics=_array(harmonics.expand(-1, -1, 3)),
         comments=comments,
     )
@@ -57,7 +57,7 @@ def export_splats(
 
 
 def import_splats(path: Path) -> Gaussians:
-    """Read Gaussians; their colours are values for the display.
+    """Read Gaussians from a .ply file; their colours are display values.
 
     Raises:
         CaptureError: The file is missing or truncated, or does not hold Gaussians.
@@ -72,42 +72,42 @@ def import_splats(path: Path) -> Gaussians:
     )
 
 
-def moved(gaussians: Gaussians, change: Similarity) -> Gaussians:
-    """The same Gaussians in another world."""
+def transformed(gaussians: Gaussians, change: Similarity) -> Gaussians:
+    """The same Gaussians in another world frame."""
     with torch.no_grad():
-        turn = torch.as_tensor(change.rotation).to(gaussians.means)
+        rotation = torch.as_tensor(change.rotation).to(gaussians.means)
         shift = torch.as_tensor(change.translation).to(gaussians.means)
         return Gaussians(
-            change.scale * gaussians.means @ turn.T + shift,
-            quaternion_from_rotation(turn @ rotation_from_quaternion(gaussians.quaternions)),
+            change.scale * gaussians.means @ rotation.T + shift,
+            quaternion_from_rotation(rotation @ rotation_from_quaternion(gaussians.quaternions)),
             gaussians.log_scales + float(np.log(change.scale)),
             gaussians.opacity_logits.clone(),
-            _turned(gaussians.harmonics, turn),
+            _rotated(gaussians.harmonics, rotation),
         )
 
 
-def _turned(
-    harmonics: Float[Tensor, "n k c"], turn: Float[Tensor, "3 3"]
+def _rotated(
+    harmonics: Float[Tensor, "n k c"], rotation: Float[Tensor, "3 3"]
 ) -> Float[Tensor, "n k c"]:
-    """Harmonics of the same colours when the world is turned: they agree in all directions."""
+    """Spherical harmonics in a rotated world frame, fitted in many directions."""
     degree = int(harmonics.shape[1] ** 0.5) - 1
     even = (torch.arange(DIRECTIONS, dtype=torch.float64) + 0.5) / DIRECTIONS
     height, around = 1 - 2 * even, torch.pi * (1 + 5**0.5) * DIRECTIONS * even
     flat = (1 - height**2).sqrt()
     directions = torch.stack([flat * around.cos(), flat * around.sin(), height], -1)
     before = spherical_harmonics(directions, degree)
-    after = spherical_harmonics(directions @ turn.T.double().cpu(), degree)
+    after = spherical_harmonics(directions @ rotation.T.double().cpu(), degree)
     mixing = torch.linalg.lstsq(after, before).solution.to(harmonics)
     return torch.einsum("jk,nkc->njc", mixing, harmonics)
 
 
-def _displayed(harmonics: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
-    """Harmonics of linear light through the sRGB curve."""
+def _as_srgb(harmonics: Float[Tensor, "n k c"]) -> Float[Tensor, "n k c"]:
+    """Spherical harmonics of linear light, converted to sRGB."""
     light = (GREY + FLAT * harmonics[:, :1]).detach().requires_grad_()
     with torch.enable_grad():
-        shown = srgb(light)
-        slope = torch.autograd.grad(shown.sum(), light)[0]
-    return torch.cat([(shown.detach() - GREY) / FLAT, slope * harmonics[:, 1:]], 1)
+        display = srgb(light)
+        slope = torch.autograd.grad(display.sum(), light)[0]
+    return torch.cat([(display.detach() - GREY) / FLAT, slope * harmonics[:, 1:]], 1)
 
 
 def _array(values: Tensor) -> Float[np.ndarray, "..."]:

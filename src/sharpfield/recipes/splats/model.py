@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from sharpfield.captures.blocks import Block
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -278,3 +279,45 @@ def align_events_to_rolling_shutter(capture: Capture) -> Capture:
 
 def _motion_unknown(capture: Capture) -> bool:
     return capture.known.motion == "unknown" and capture.frames is not None
+
+
+def merge_blocks(models: Sequence[object], blocks: Sequence[Block]) -> SplatModel:
+    """The first model with the Gaussians of all, static and moving.
+
+    Its learned calibration (thresholds, gains, poses) is that of the first model.
+
+    Args:
+        models: Trained on one block each, in the order of `blocks`.
+        blocks: Of one capture.
+
+    Raises:
+        OptionError: A model is not made of Gaussians, or their world frames differ.
+    """
+    splats = [model for model in models if isinstance(model, SplatModel)]
+    if len(splats) != len(models):
+        raise OptionError(
+            "only scenes of Gaussians can be merged",
+            got=", ".join(sorted({type(model).__module__ for model in models})),
+            do="train a splat recipe, such as room-splat",
+        )
+    first = splats[0]
+    for other in splats[1:]:
+        if abs(other.change.scale / first.change.scale - 1) > 1e-9:
+            raise OptionError("the world frames of blocks differ", do="train them on one capture")
+    for kind in ("static", "moving"):
+        parts = [
+            _inside_block(model, getattr(model.scene, kind), block)
+            for model, block in zip(splats, blocks, strict=True)
+            if getattr(model.scene, kind) is not None
+        ]
+        if parts:
+            merged = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+            getattr(first.scene, kind).replace(merged)
+    return first
+
+
+def _inside_block(model: SplatModel, gaussians: Gaussians, block: Block) -> dict[str, Tensor]:
+    """The parameters of the Gaussians whose means lie in a block."""
+    means = model.change.inverse().points(gaussians.means.detach().cpu().double().numpy())
+    inside = torch.from_numpy(block.contains(means)).to(gaussians.means.device)
+    return {name: tensor.detach()[inside] for name, tensor in gaussians.points().items()}

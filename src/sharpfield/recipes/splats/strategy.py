@@ -23,7 +23,7 @@ RESET_ROUNDS = 30
 """Rounds of densification after which opacities are reset."""
 
 EXTENT = 2.0
-"""Size of a normalised scene, by which large and huge Gaussians are told."""
+"""Size of a normalised scene, the unit of the scales that split and prune."""
 
 Grown = Sequence[tuple[PointSet, Growth]]
 
