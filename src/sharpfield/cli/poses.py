@@ -47,6 +47,7 @@ class Elsewhere:
     def mount(self) -> "Mount":
         """How the body and the clock of the file relate to the camera's."""
         from sharpfield.captures.paths.pose_layouts import read_hand_eye
+        from sharpfield.preparation.poses.external import Mount
 
         hand = None if self.hand_eye is None else read_hand_eye(self.hand_eye)
         return Mount(round(1000 * self.offset_ms), hand)

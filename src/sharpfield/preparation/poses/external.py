@@ -18,9 +18,13 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 from sharpfield.geometry.two_views import depths_of, find_features, match_pairs, pairs_apart
-from sharpfield.preparation.poses.find import events_on_path, split_of
 from sharpfield.preparation.poses.images import sfm_images
-from sharpfield.preparation.poses.path import FramesOnPath, frames_of, path_through
+from sharpfield.preparation.poses.path import (
+    FramesOnPath,
+    capture_on_path,
+    frames_of,
+    path_through,
+)
 from sharpfield.preparation.poses.world import KnownPoses
 
 PAIRS = 12
@@ -70,23 +74,10 @@ def attach(
         frame, poses = _by_frame(capture, path, poses)
         middle = capture.needed_frames.exposure.middle_us[frame]
         laid = path_through(capture.needed_frames, frame, middle, poses, capture.clock)
-    streams = {
-        name: None
-        if (held := getattr(capture, name)) is None
-        else events_on_path(held, laid.path, laid)
-        for name in ("events", "test_events")
-    }
     made = replace(
-        capture,
-        trajectory=laid.path,
-        frames=laid.frames,
-        split=split_of(capture.split, laid.kept, np.zeros(0, np.int64)),
-        depth=None
-        if capture.depth is None
-        else replace(capture.depth, stored=capture.depth.stored[laid.kept]),
+        capture_on_path(capture, laid),
         known=replace(capture.known, poses="known", bounds="known"),
         notes=capture.notes | {"poses_from": f"a file ({path.layout})"},
-        **streams,
     )
     made = _with_model(made, path)
     if bounds is None and capture.known.bounds == "unknown" and path.model is None:

@@ -12,11 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from sharpfield.core.capture import Capture, Split
+from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.events import EventStream
 from sharpfield.geometry.space import Similarity
-from sharpfield.geometry.trajectory import Stamped, Still, Tracks
 from sharpfield.preparation.options import ImageSource, PoseOptions
 from sharpfield.preparation.poses.find_checks import Relief, relief
 from sharpfield.preparation.poses.images import SfmImages, sfm_images
@@ -29,7 +27,7 @@ from sharpfield.preparation.poses.mapping import (
     MatchCounts,
     map_images,
 )
-from sharpfield.preparation.poses.path import FramesOnPath, path_through
+from sharpfield.preparation.poses.path import FramesOnPath, capture_on_path, path_through
 from sharpfield.preparation.poses.world import (
     KnownPoses,
     PoseErrors,
@@ -128,28 +126,6 @@ def find_poses(
     )
 
 
-def events_on_path(
-    events: EventStream, path: Stamped | Still | Tracks, laid: FramesOnPath
-) -> EventStream:
-    """Events of tracks and times with known poses, their tracks renumbered."""
-    if events.track is not None:
-        track = laid.track_of[np.asarray(events.track, np.int64)]
-        there = np.flatnonzero(track >= 0)
-        events = replace(
-            events,
-            x=events.x[there],
-            y=events.y[there],
-            t_us=events.t_us[there],
-            p=events.p[there],
-            track=track[there].astype(np.uint16),
-            tracks=int(laid.track_of.max()) + 1,
-        )
-    spans = [span for t in range(events.tracks) if (span := path.known_us(t)) is not None]
-    if not spans:
-        return events
-    return events.window(min(s[0] for s in spans), max(s[1] for s in spans) + 1)
-
-
 def _instants(capture: Capture, source: ImageSource) -> int:
     """Images of each exposure: the motion during long exposures is not linear."""
     blurred = int((~capture.needed_frames.exposure.instant).sum())
@@ -180,39 +156,17 @@ def _with_poses(
     good = good if good.any() else np.ones_like(good)
     near, far = np.percentile(depths(found)[good[found.observations[:, 1]]], BOUNDS_PERCENT)
     unsure = np.setdiff1d(np.arange(len(capture.needed_frames)), images.frame[there])
-    streams = {
-        name: None
-        if (held := getattr(capture, name)) is None
-        else events_on_path(held, laid.path, laid)
-        for name in ("events", "test_events")
-    }
     made = replace(
-        capture,
+        capture_on_path(capture, laid, without=unsure),
         camera=found.camera,
-        trajectory=laid.path,
         near=float(near) / BOUNDS_MARGIN,
         far=float(far) * BOUNDS_MARGIN,
-        frames=laid.frames,
-        split=split_of(capture.split, laid.kept, unsure),
         points=found.points[good],
-        depth=None
-        if capture.depth is None
-        else replace(capture.depth, stored=capture.depth.stored[laid.kept]),
         known=replace(capture.known, poses="known", intrinsics="known", bounds="known"),
         notes=capture.notes
         | {"poses_from": f"structure from motion, {images.source}, {intrinsics} lens"},
-        **streams,
     )
     return made, laid
-
-
-def split_of(split: Split, kept: Int64[np.ndarray, "m"], unsure: Int64[np.ndarray, "u"]) -> Split:
-    """A split in the indices of the kept frames, without frames whose pose is unsure."""
-    sure = ~np.isin(kept, unsure)
-    return Split(
-        train=np.flatnonzero(sure & np.isin(kept, split.train)),
-        test=np.flatnonzero(sure & np.isin(kept, split.test)),
-    )
 
 
 def _why(image: int, images: SfmImages, counts: MatchCounts) -> tuple[str, str]:

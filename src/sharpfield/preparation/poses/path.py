@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from sharpfield.core.capture import Clock
+from sharpfield.core.capture import Capture, Clock, Split
+from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped, Still, Tracks
@@ -107,6 +108,59 @@ def path_through(
     if len(moving) == 1 and not standing:
         path = moving[0]
     return FramesOnPath(frames_of(frames, kept, track_of[frames.track[kept]]), path, kept, track_of)
+
+
+def capture_on_path(
+    capture: Capture, laid: FramesOnPath, *, without: Int64[np.ndarray, "u"] | None = None
+) -> Capture:
+    """A capture with another trajectory: only frames and events that it covers are kept.
+
+    Args:
+        capture: Poses it has are not used.
+        laid: The trajectory, and the frames on it.
+        without: Frames whose pose is unsure: neither trained on nor held out.
+    """
+    depth = capture.depth
+    return replace(
+        capture,
+        trajectory=laid.path,
+        frames=laid.frames,
+        split=_split_of(capture.split, laid.kept, np.zeros(0, int) if without is None else without),
+        depth=None if depth is None else replace(depth, stored=depth.stored[laid.kept]),
+        events=_events_on_path(capture.events, laid),
+        test_events=_events_on_path(capture.test_events, laid),
+    )
+
+
+def _events_on_path(events: EventStream | None, laid: FramesOnPath) -> EventStream | None:
+    """Events of tracks and times with known poses, their tracks renumbered."""
+    if events is None:
+        return None
+    if events.track is not None:
+        track = laid.track_of[np.asarray(events.track, np.int64)]
+        there = np.flatnonzero(track >= 0)
+        events = replace(
+            events,
+            x=events.x[there],
+            y=events.y[there],
+            t_us=events.t_us[there],
+            p=events.p[there],
+            track=track[there].astype(np.uint16),
+            tracks=int(laid.track_of.max()) + 1,
+        )
+    spans = [span for t in range(events.tracks) if (span := laid.path.known_us(t)) is not None]
+    if not spans:
+        return events
+    return events.window(min(s[0] for s in spans), max(s[1] for s in spans) + 1)
+
+
+def _split_of(split: Split, kept: Int64[np.ndarray, "m"], unsure: Int64[np.ndarray, "u"]) -> Split:
+    """A split in the indices of the kept frames, without frames whose pose is unsure."""
+    sure = ~np.isin(kept, unsure)
+    return Split(
+        train=np.flatnonzero(sure & np.isin(kept, split.train)),
+        test=np.flatnonzero(sure & np.isin(kept, split.test)),
+    )
 
 
 def _beyond(
