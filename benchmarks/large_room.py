@@ -152,7 +152,7 @@ def stages(arguments: list[str], told: Path) -> None:
     for name, (module, function) in STAGES.items():
         place = importlib.import_module(module)
         setattr(place, function, watched(getattr(place, function), times[name]))
-    from sharpfield.cli.main import main as command
+    from sharpfield.cli.commands import main as command
 
     try:
         command(arguments)

@@ -21,7 +21,7 @@ import torch
 
 from benchmarks.table import Row, save, show
 from sharpfield.captures.native import layout as native
-from sharpfield.cli.main import main as sharpfield
+from sharpfield.cli.commands import main as sharpfield
 from sharpfield.core.capture import Capture
 from sharpfield.geometry.se3 import quaternion_from_rotation
 from sharpfield.geometry.trajectory import Stamped

@@ -1,5 +1,5 @@
 """`python -m sharpfield` is the command line."""
 
-from sharpfield.cli.main import main
+from sharpfield.cli.commands import main
 
 main()

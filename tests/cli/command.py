@@ -1,6 +1,6 @@
 """Commands as a user types them."""
 
-from sharpfield.cli.main import main
+from sharpfield.cli.commands import main
 
 
 def run(*words: object) -> int:

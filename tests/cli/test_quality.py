@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.read import read_capture
-from sharpfield.cli.main import main
+from sharpfield.cli.commands import main
 
 
 def run(*words: str) -> None:

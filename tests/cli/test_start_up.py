@@ -11,7 +11,7 @@ SOURCE = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2] / "src")}
 HEAVY = {"torch", "numba", "cv2", "matplotlib", "h5py", "av"}
 WATCHED = """
 import sys
-from sharpfield.cli.main import main
+from sharpfield.cli.commands import main
 try:
     main(sys.argv[1:])
 finally:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from sharpfield.cli import main as command_line
+from sharpfield.cli import commands as command_line
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
 from sharpfield.recipes.settings.options import changed

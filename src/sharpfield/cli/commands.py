@@ -68,16 +68,16 @@ GROUPS: dict[str, dict[str, Command]] = {
         "blocks": Command("blocks:blocks_command", "train a long capture in blocks", recipe=True),
     },
     "look": {
-        "evaluate": Command("evaluate:evaluate_command", "measure a run on held-out views"),
+        "evaluate": Command("look:evaluate_command", "measure a run on held-out views"),
         "render": Command(
-            "render:render_command",
+            "look:render_command",
             "render a video or images along a camera path",
             renamed={"images": "frames", "rate": "fps"},
         ),
         "events": Command(
             "events:events_command", "render the events a camera would report in a scene"
         ),
-        "export": Command("export:export_command", "write the Gaussians of a run as a .ply"),
+        "export": Command("look:export_command", "write the Gaussians of a run as a .ply"),
     },
     "tools": {
         "recipes": Command(
