@@ -3,7 +3,7 @@
 import torch
 
 from sharpfield.fields.image_features import MAPS, FeatureExtractor, Merging, Mixing
-from sharpfield.ops.pyramid import look_up
+from sharpfield.ops.pyramid import sample_pyramid
 
 
 def test_maps_are_a_half_a_quarter_and_an_eighth():
@@ -32,7 +32,7 @@ def test_reading_equals_enlarging_and_taking_the_pixel():
     y, x = torch.meshgrid(torch.arange(48), torch.arange(64), indexing="ij")
     xy = torch.stack([x, y], -1).reshape(-1, 2).double() + 0.5
     source = torch.full((len(xy),), 2)
-    found = look_up(xy, source, levels)
+    found = sample_pyramid(xy, source, levels)
     assert torch.allclose(found, whole[2].movedim(0, -1).reshape(-1, 45), atol=1e-12)
 
 

@@ -4,8 +4,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel, motion_kernels
-from sharpfield.ops.patch import best_match, convolve, convolve_all, unfold
+from sharpfield.formation.patch_kernel import (
+    ChosenKernel,
+    LearnedKernel,
+    best_match,
+    convolve,
+    convolve_all,
+    motion_kernels,
+    unfold,
+)
 
 ROUNDED = 1e-4
 """Published values have four decimals."""

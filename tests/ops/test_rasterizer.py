@@ -260,5 +260,5 @@ def test_what_is_too_faint_is_left_out() -> None:
 
 def test_lenses_with_distortion_are_refused() -> None:
     bent = dataclasses.replace(CAMERA, lens="brown", distortion=(0.1, 0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(AssertionError, match="distortion"):
+    with pytest.raises(AssertionError, match="without distortion"):
         Canvas(bent, torch.zeros(1, 2, dtype=torch.int64), (WIDTH, HEIGHT))

@@ -4,6 +4,10 @@ A rendered patch is sharp, a recorded one may be blurred. Before they are compar
 is blurred by the kernel that makes it most similar to the recorded one. One kernel is the identity,
 so that sharp patches stay sharp. Kernels do not depend on cameras or depth.
 
+Patches are `[m, h, w, c]`; kernels `[m, k, k]` or `[q, k, k]` with an odd k, centred on the pixel
+that they make. Pixels outside a patch are zero. Kernels are applied by correlation, without
+flipping them; sets of kernels that are closed under half turns are not affected.
+
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.2; sizes and rules from the released code.
 """
 
@@ -11,12 +15,11 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.seed import generator
 from sharpfield.ops.dense import LeakyLayers
-from sharpfield.ops.patch import best_match, convolve, convolve_all
 
 PARTS, FINE = 32, 1024
 """Subpixel positions are rounded to 1/PARTS, from sums rounded to 1/FINE, as OpenCV used to do when
@@ -181,3 +184,42 @@ def _between(one: Float[Tensor, "k k"], other: Float[Tensor, "k k"]) -> Float[Te
     """The sum of two coordinates, rounded."""
     fine = (FINE * one).round() + (FINE * other).round()
     return ((fine + FINE / PARTS / 2) / (FINE / PARTS)).floor() / PARTS
+
+
+def unfold(patches: Float[Tensor, "m h w c"], size: int) -> Float[Tensor, "m h w c s"]:
+    """The `size` x `size` pixels around each pixel, row after row; s = size^2.
+
+    Args:
+        patches: Any.
+        size: Odd.
+    """
+    m, h, w, c = patches.shape
+    image = patches.movedim(-1, 1).reshape(m * c, 1, h, w)
+    around = torch.nn.functional.unfold(image, size, padding=size // 2)  # [m c, s, h w]
+    return around.view(m, c, size * size, h, w).permute(0, 3, 4, 1, 2)
+
+
+def convolve(
+    patches: Float[Tensor, "m h w c"], kernels: Float[Tensor, "m k k"]
+) -> Float[Tensor, "m h w c"]:
+    """One kernel on each patch."""
+    around = unfold(patches, kernels.shape[-1])
+    return torch.einsum("mhwcs,ms->mhwc", around, kernels.flatten(1))
+
+
+def convolve_all(
+    patches: Float[Tensor, "m h w c"], kernels: Float[Tensor, "q k k"]
+) -> Float[Tensor, "m q h w c"]:
+    """Every kernel on every patch."""
+    around = unfold(patches, kernels.shape[-1])
+    return torch.einsum("mhwcs,qs->mqhwc", around, kernels.flatten(1))
+
+
+def best_match(
+    candidates: Float[Tensor, "m q h w c"], wanted: Float[Tensor, "m h w c"]
+) -> Int64[Tensor, "m"]:
+    """The candidate of each patch with the smallest sum of absolute differences; the first of ties.
+
+    Source: Hybrid Neural Rendering (CVPR 2023), section 3.2.
+    """
+    return (candidates - wanted[:, None]).abs().flatten(2).sum(-1).argmin(-1)

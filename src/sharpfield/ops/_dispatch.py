@@ -1,4 +1,4 @@
-"""One name per operation; the plain torch version defines the truth, others must match it.
+"""One name per operation; the plain torch version is the reference that all others must match.
 
 An *op* is a function of tensors with a *reference* in plain torch. `ops/fast/<file>.py` may
 register a *fast* version per device for the ops of `ops/<file>.py`; it is imported on the first
@@ -8,7 +8,7 @@ call, so that importing the package compiles nothing. `SHARPFIELD_OPS` (or `usin
 - `reference`: always the reference;
 - `fast`: the fast version; an op without one fails.
 
-Nothing is caught and silently slowed: `versions` says which version each op ran, for the run's log.
+There is no silent fallback: `versions` lists which version each op ran, for the run's log.
 """
 
 import contextlib

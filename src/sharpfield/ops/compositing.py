@@ -1,8 +1,8 @@
 """Volume rendering along a ray: density to weights, weights to colour, depth and opacity.
 
-Vocabulary: a *sample* j stands for a stretch of the ray of length `delta`; `clear` = exp(-density
-delta) is the share of light that passes it; its *weight* is the share of the pixel's light that
-comes from it. All functions work on any leading axes `*b` and on any device.
+Vocabulary: a *sample* j represents a segment of the ray of length `delta`; its *alpha* = 1 -
+exp(-density delta) is the share of light that it absorbs, its *weight* the share of the pixel's
+light that comes from it. All functions work on any leading axes `*b` and on any device.
 
 Source: NeRF (ECCV 2020), eq. 3; the small constant inside the transmittance and the opaque last
 sample follow the released code of Deblur-NeRF, DP-NeRF and Ev-DeblurNeRF.
@@ -17,7 +17,7 @@ from torch import Tensor
 from sharpfield.ops._dispatch import Op
 
 LEAK = 1e-10
-"""Added to the share of light that passes each sample, so that a product never becomes zero."""
+"""Added to 1 - alpha of each sample, so that the transmittance never becomes zero."""
 
 ENDLESS = 1e10
 """Length given to the last sample of a ray that has no end: any density there is opaque."""
@@ -25,7 +25,7 @@ ENDLESS = 1e10
 
 @dataclass(frozen=True)
 class Composited:
-    """What a ray sees."""
+    """The result of compositing for rays."""
 
     rgb: Float[Tensor, "*b c"]
     depth: Float[Tensor, "*b"]
@@ -38,12 +38,12 @@ class Composited:
 def gaps(
     depth: Float[Tensor, "*b s"], length: Float[Tensor, "*b"], *, last: float = ENDLESS
 ) -> Float[Tensor, "*b s"]:
-    """Stretch of ray that each point sample stands for: from itself to the next one.
+    """Length of the segment of each point sample: from itself to the next one.
 
     Args:
         depth: Ray parameter of the samples, ascending.
         length: Length of the ray's direction, e.g. in normalised device coordinates.
-        last: Ray parameter covered by the last sample, which has no successor.
+        last: Length, in ray parameter, of the last segment, which has no end.
     """
     end = torch.full_like(depth[..., :1], last)
     return torch.cat([depth.diff(dim=-1), end], -1) * length[..., None]
@@ -52,12 +52,12 @@ def gaps(
 def opacities(
     density: Float[Tensor, "*b s"], delta: Float[Tensor, "*b s"], *, opaque_end: bool = False
 ) -> Float[Tensor, "*b s"]:
-    """Share of the arriving light that each sample stops: 1 - exp(-density delta).
+    """Alpha of each sample: 1 - exp(-density delta).
 
     Args:
         density: Not negative.
-        delta: Length of the sample's stretch.
-        opaque_end: The last sample stops everything (the far end of normalised device
+        delta: Length of each segment.
+        opaque_end: The last sample absorbs everything (the far end of normalised device
             coordinates is at infinity).
     """
     alpha = 1 - torch.exp(-density * delta)
@@ -67,10 +67,10 @@ def opacities(
 
 
 def weights_of_opacities(alpha: Float[Tensor, "*b s"]) -> Float[Tensor, "*b s"]:
-    """Share of a ray's light from each sample: w_j = alpha_j prod_{k<j} (1 - alpha_k + 1e-10)."""
+    """Weights of samples: w_j = alpha_j prod_{k<j} (1 - alpha_k + 1e-10) (NeRF eq. 3)."""
     first = torch.ones_like(alpha[..., :1])
-    passed = torch.cat([first, 1 - alpha[..., :-1] + LEAK], -1).cumprod(-1)
-    return alpha * passed
+    transmittance = torch.cat([first, 1 - alpha[..., :-1] + LEAK], -1).cumprod(-1)
+    return alpha * transmittance
 
 
 @Op
@@ -79,7 +79,7 @@ def weigh(
 ) -> Float[Tensor, "*b s"]:
     """Weights of the samples, without colour: `weights_of_opacities(opacities(...))`.
 
-    Call this alone where the colour of samples with next to no weight is to be skipped, see
+    Call this first where the colour of samples of negligible weight is to be skipped, see
     `gather_kept`.
     """
     return weights_of_opacities(opacities(density, delta, opaque_end=opaque_end))
@@ -105,8 +105,8 @@ def gather_kept(
 
     Args:
         weights: Of all samples.
-        kept: The samples whose value was computed, counted along one ray after the other.
-        value: Theirs.
+        kept: Flat indices of the samples whose value was computed, one ray after the other.
+        value: Of these samples.
     """
     rays, samples = weights.shape
     light = weights.flatten().index_select(0, kept)[:, None] * value
@@ -121,13 +121,13 @@ def composite(
     *,
     opaque_end: bool = False,
 ) -> Composited:
-    """Everything a ray sees: weights, colour, depth and opacity.
+    """Weights, colour, depth and opacity of rays.
 
     Args:
         density: Not negative, per unit of `delta`.
-        delta: Stretch of ray each sample stands for, e.g. `edges.diff(dim=-1)` or `gaps(...)`.
+        delta: Length of each segment, e.g. `edges.diff(dim=-1)` or `gaps(...)`.
         colour: Linear; any number of channels.
-        depth: Where each sample is.
+        depth: Ray parameter of each sample.
         opaque_end: See `opacities`.
     """
     weights = weigh(density, delta, opaque_end=opaque_end)

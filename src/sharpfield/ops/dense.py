@@ -1,12 +1,8 @@
-"""Small networks: layers with skips, a first layer split in two, a learned vector per frame.
+"""Small MLPs: with skips, with a split first layer, with leaky ReLU; a learned vector per frame.
 
-Every parameter comes from an explicit generator; the default is PyTorch's own rule for linear
-layers, weights and biases uniform in +-1/sqrt(inputs).
-
-Small networks with leaky activations, as Point-NeRF and its descendants have them.
-
-Weights start by Xavier's rule, evenly distributed, with the gain of what follows them; biases start
-at zero.
+All initial parameters come from an explicit generator. `linear` and `Dense` use PyTorch's default
+for linear layers, weights and biases uniform in +-1/sqrt(inputs); `LeakyLayers`, as in Point-NeRF
+and its successors, uniform Xavier weights with the gain of the activation, and zero biases.
 """
 
 import itertools
@@ -39,10 +35,10 @@ class Dense(nn.Module):
 
     Args:
         sizes: Widths from input to output, e.g. `[63, 256, 256, 4]` for three layers.
-        generator: Where the first parameters come from.
+        generator: Draws the initial parameters.
         bias: Whether layers have one.
         activation: Between layers.
-        skips: The input is appended again to the input of these layers; layer 0 is the first.
+        skips: The input is concatenated again to the input of these layers; layer 0 is the first.
             The network of NeRF is `sizes=[63] + 8 * [256]`, `skips=(5,)`.
     """
 
@@ -89,14 +85,14 @@ def apply_linear(
 class SplitLinear(nn.Module):
     """A linear layer whose input is [features of a sample, features of its ray].
 
-    Equal to concatenating the two, but the ray's part is computed once per ray and added to every
-    sample of it: nothing is repeated and nothing is joined.
+    Equal to a layer of the concatenated input, but the ray's part is computed once per ray and
+    added to each of its samples, so that nothing is repeated or copied.
 
     Args:
         per_sample: Width of the samples' features.
         per_ray: Width of the ray's features, e.g. the encoding of its direction.
         outputs: Width of the result.
-        generator: Where the first parameters come from.
+        generator: Draws the initial parameters.
         bias: Whether the layer has one.
     """
 
@@ -139,7 +135,7 @@ SLOPE = 0.01
 """Of the activation below zero."""
 
 GAIN = nn.init.calculate_gain("leaky_relu", SLOPE)
-"""Of weights that an activation follows."""
+"""Xavier gain of layers that are followed by the activation."""
 
 
 def leaky(x: Float[Tensor, "*b f"]) -> Float[Tensor, "*b f"]:
@@ -148,7 +144,7 @@ def leaky(x: Float[Tensor, "*b f"]) -> Float[Tensor, "*b f"]:
 
 
 def xavier(layer: nn.Linear | nn.Conv2d, gain: float, generator: torch.Generator) -> None:
-    """Give a layer its first parameters."""
+    """Set the initial parameters of a layer."""
     nn.init.xavier_uniform_(layer.weight, gain, generator=generator)
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
@@ -161,7 +157,7 @@ class LeakyLayers(nn.Module):
 
     Args:
         sizes: Widths from input to output.
-        generator: Where the first parameters come from.
+        generator: Draws the initial parameters.
         ends: Whether an activation follows the last layer, too: `leaky`, or `linear` if not.
     """
 
@@ -179,21 +175,21 @@ class LeakyLayers(nn.Module):
             self.layers.append(layer)
 
     def forward(self, *parts: Float[Tensor, "*_b _f"]) -> Float[Tensor, "*b o"]:
-        """Apply all layers to parts of an input that lie side by side."""
+        """Apply all layers to the concatenation of parts of an input."""
         hidden = self.first(*parts)
         if len(self.layers) == 1 and self.ends == "linear":
             return hidden
         return self.rest(leaky(hidden))
 
     def first(self, *parts: Float[Tensor, "*_b _f"], skipped: int = 0) -> Float[Tensor, "*b o"]:
-        """What the first layer makes of some parts of its input, before the activation.
+        """The first layer for some parts of its input, before the activation.
 
-        A layer of parts is the sum of one layer for each of them: nothing is joined, and parts that
-        many rows share are worked out once. The bias counts with the part that comes first.
+        A layer of a concatenation is the sum of one layer for each part: nothing is copied, and
+        parts that many rows share are computed once. The bias is added with the first part.
 
         Args:
-            parts: Lie side by side in the input.
-            skipped: Features of the input before them.
+            parts: Consecutive parts of the input.
+            skipped: Number of input features before them.
         """
         layer = self.layers[0]
         assert isinstance(layer, nn.Linear)
@@ -208,7 +204,7 @@ class LeakyLayers(nn.Module):
         return out
 
     def rest(self, hidden: Float[Tensor, "*b h"]) -> Float[Tensor, "*b o"]:
-        """The layers after the first, whose activation is behind us."""
+        """The layers after the first, whose activation was already applied."""
         last = len(self.layers) - 1
         for index, layer in enumerate(self.layers):
             if index == 0:

@@ -1,4 +1,4 @@
-"""Encodings that let a small network see fine detail: frequencies and spherical harmonics.
+"""Input encodings of small networks: frequencies (positional encoding) and spherical harmonics.
 
 Sources: NeRF (ECCV 2020), eq. 4, with the coordinate itself kept and without the factor pi;
 Sloan, *Efficient Spherical Harmonic Evaluation* (JCGT 2013) for the real basis.
@@ -19,14 +19,14 @@ def frequencies(x: Float[Tensor, "*b d"], octaves: int) -> Float[Tensor, "*b f"]
         octaves: The number L of frequencies; 0 leaves `x` as it is.
     """
     octave = torch.arange(octaves, dtype=x.dtype, device=x.device).repeat_interleave(2)
-    # A cosine is a sine a quarter turn on: one call, whose result lies as it is wanted.
+    # cos x = sin(x + pi/2): a single call, whose result already has the right order.
     turn = torch.tensor([0, math.pi / 2], dtype=x.dtype, device=x.device).repeat(octaves)
     angle = torch.addcmul(turn[:, None], x[..., None, :], 2.0 ** octave[:, None])
     return torch.cat([x, angle.sin().flatten(-2)], -1)  # angle: [*b, 2 octaves, d]
 
 
 def frequencies_width(coordinates: int, octaves: int) -> int:
-    """Number of features that `frequencies` makes."""
+    """Number of features of `frequencies`."""
     return coordinates * (1 + 2 * octaves)
 
 

@@ -57,7 +57,7 @@ def line_features(points: Float[Tensor, "*b"], line: Float[Tensor, "l c"]) -> Fl
     """Linear lookup in one line.
 
     Args:
-        points: Place along the line in box coordinates.
+        points: Position along the line in box coordinates.
         line: Features by cell.
     """
     on_plane = torch.stack([torch.zeros_like(points), points], -1)

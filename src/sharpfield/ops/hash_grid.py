@@ -1,10 +1,10 @@
-"""Features looked up in grids of several resolutions, the fine ones hashed into tables of one size.
+"""Multiresolution hash grid: features looked up in grids, the fine ones hashed into tables.
 
-Vocabulary: a *level* is a grid of `cells` cubes per axis, so of cells + 1 corners. A level whose
-corners are no more than the entries of a table keeps each corner in an entry of its own; finer
-levels share entries by a hash of the corner, and training sorts out who needs them. All levels lie
-one after the other in one table `[entries, f]`. Points are in box coordinates, -1 to 1; points
-outside take the features of the nearest point of the box.
+Vocabulary: a *level* is a grid of `cells` cubes per axis, so of cells + 1 corners. A level with no
+more corners than a table has entries stores each corner in an entry of its own; finer levels share
+entries by a hash of the corner, and training resolves collisions. All levels are consecutive in one
+table `[entries, f]`. Points are in box coordinates, -1 to 1; points outside get the features of the
+nearest point of the box.
 
 Source: Instant-NGP (SIGGRAPH 2022), eqs. 1 to 4.
 """
@@ -23,7 +23,7 @@ PRIMES = (1, 2_654_435_761, 805_459_861)
 
 @dataclass(frozen=True)
 class HashLayout:
-    """Where each level lies in the table."""
+    """Sizes of the levels, and their entries in the table."""
 
     cells: tuple[int, ...]
     """Of each level along each axis."""
@@ -59,7 +59,7 @@ def hash_layout(*, levels: int, coarsest: int, growth: float, table_bits: int) -
 def entries_of_corners(
     corners: Int[Tensor, "*b 3"], cells: int, entries: int, *, hashed: bool
 ) -> Int[Tensor, "*b"]:
-    """Where the corners of one level lie, counted from the level's first entry (eq. 4)."""
+    """Entries of the corners of one level, counted from the level's first entry (eq. 4)."""
     x, y, z = corners.unbind(-1)
     if not hashed:
         return x + (cells + 1) * (y + (cells + 1) * z)
@@ -76,7 +76,7 @@ def hash_features(
     Args:
         points: x, y and z in box coordinates.
         table: Features of all entries of all levels.
-        layout: Where each level lies in the table.
+        layout: Of the levels in the table.
 
     Returns:
         The f features of each level, one level after the other.
@@ -85,13 +85,13 @@ def hash_features(
     found: list[Tensor] = []
     levels = zip(layout.cells, layout.entries, layout.hashed, layout.starts, strict=True)
     for cells, entries, hashed, start in levels:
-        place = unit * cells
-        # Not a number stays one, in the share.
-        low = place.detach().floor().clamp_max(cells - 1).nan_to_num()
-        share = (place - low)[..., None, :]  # [*b, 1, 3]
+        position = unit * cells
+        # NaN stays NaN, in the fraction.
+        low = position.detach().floor().clamp_max(cells - 1).nan_to_num()
+        fraction = (position - low)[..., None, :]  # [*b, 1, 3]
         corner = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)  # [8, 3]
         which = low.long()[..., None, :] + corner  # [*b, 8, 3]
-        weight = torch.where(corner == 1, share, 1 - share).prod(-1)  # [*b, 8]
+        weight = torch.where(corner == 1, fraction, 1 - fraction).prod(-1)  # [*b, 8]
         entry = start + entries_of_corners(which, cells, entries, hashed=hashed)
         found.append((weight[..., None] * table[entry]).sum(-2))
     return torch.cat(found, -1)

@@ -1,14 +1,14 @@
-"""Points near a place, and the parts of a ray that pass near points, among millions of points.
+"""Nearest neighbours of positions, and samples of rays near points, among millions of points.
 
-Vocabulary: space is cut into cubic *cells*, and 4x4x4 cells make a *brick*. Only bricks near points
-are kept: a small *table* of all bricks tells which. Points are listed cell after cell. A cell is
-*near* if it, or one of the cells around it (the *window*), holds a point. All of it is made once
-for points that stay where they are; memory and time grow with the points and not with the space
-between them.
+Vocabulary: space is divided into cubic *cells*, and 4x4x4 cells form a *brick*. Only bricks near
+points are stored; a small *table* holds the number of each. Points are listed cell after cell. A
+cell is *near* if it, or one of the cells around it (the *window*), contains a point. The structure
+is built once for static points; memory and time grow with the number of points and not with the
+space between them.
 
 Source: the query of Point-NeRF (CVPR 2022), section 4.1, which rebuilds a dense grid for every
 batch, keeps a random choice of points where a cell is full, and stops at the first cells that hold
-enough; here neighbours are those that are truly nearest in the window.
+enough; here neighbours are the exact nearest within the window.
 """
 
 import itertools
@@ -33,10 +33,10 @@ MOST_BRICKS = 1 << 28
 """Of the table: 1 GiB."""
 
 CHUNK = 1 << 14
-"""Queries that the definition works on at once."""
+"""Queries that the reference processes at once."""
 
 HELD = 1 << 16
-"""Cells whose surroundings are worked on at once: few enough to stay close to the CPU."""
+"""Cells whose windows are processed at once: few enough for the CPU's cache."""
 
 
 @dataclass(frozen=True)
@@ -52,23 +52,23 @@ class Cells:
     table: Int32[Tensor, "x y z"]
     """Number of each brick; -1 where no point is near."""
     start: Int32[Tensor, "m"]
-    """Where the list of each cell begins; cell c of brick b is 64 b + c. Ends with their count."""
+    """Start of each cell's list; cell c of brick b is 64 b + c. The last entry is the count."""
     near: Bool[Tensor, "k"]
     """Cells that have points in their window."""
     order: Int64[Tensor, "n"]
     """The points, cell after cell."""
     places: Float[Tensor, "n 3"]
-    """Where they are, in that order."""
+    """Their positions, in that order."""
 
 
 def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1) -> Cells:
-    """Make the lists in which neighbours are looked up.
+    """Build the cell lists in which neighbours are looked up.
 
     Args:
         points: At least one.
-        edge: Of a cell. Neighbours within `reach * edge` are all found; farther ones only if they
+        edge: Of a cell. All neighbours within `reach * edge` are found; farther ones only if they
             are in the window.
-        reach: How many cells the window extends to each side.
+        reach: Cells by which the window extends to each side.
 
     Raises:
         OptionError: Points are spread over more bricks than the table may have.
@@ -84,7 +84,7 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
             "points are spread too far for cells so small",
             got=f"{len(points)} points over {extent[0]:.3g} x {extent[1]:.3g} x {extent[2]:.3g}"
             f" in cells of {edge:.3g}",
-            do="take larger voxels, or leave out points that lie far off",
+            do="use larger voxels, or leave out distant points",
         )
     key = _key(cell, bricks)
     key, order = key.sort(stable=True)
@@ -117,7 +117,7 @@ def sort_into_cells(points: Float[Tensor, "n 3"], edge: float, *, reach: int = 1
 
 
 def window(reach: int) -> list[tuple[int, int, int]]:
-    """Offsets of the cells of a window: the own one first."""
+    """Offsets of the cells of a window: the central one first."""
     steps = range(-reach, reach + 1)
     around = [(x, y, z) for x in steps for y in steps for z in steps]
     return sorted(around, key=lambda step: step != (0, 0, 0))
@@ -141,8 +141,8 @@ def neighbours(
         radius: They are closer than this.
 
     Returns:
-        Rows of the points, near to far, -1 where there are no more; and the way from the query to
-        each of them, zero where there is none.
+        Rows of the points, near to far, -1 where there are no more; and the offset from the query
+        to each of them, zero where there is none.
     """
     begins = range(0, len(queries), CHUNK)
     detached = queries.detach()
@@ -166,18 +166,18 @@ def first_near(
     cells: Cells,
     most: int,
 ) -> tuple[Int64[Tensor, "b s"], Float[Tensor, "b s 3"]]:
-    """The first places on rays that lie in cells near points.
+    """The first samples on rays that are in cells near points.
 
     Args:
         origin: Of rays.
-        direction: Of one unit of `place`.
-        place: Ray parameters to choose from, ascending.
+        direction: Change of position per unit of `place`.
+        place: Ray parameters of the samples, ascending.
         cells: Made of the points.
-        most: The number s of places for each ray.
+        most: The number s of samples for each ray.
 
     Returns:
-        Which of the places, -1 where there are no more; and where in space they are, zero where
-        there are none.
+        Indices of the samples, -1 where there are no more; and their positions, zero where there
+        are none.
     """
     at = along(origin.detach(), direction.detach(), place.detach())
     near = _cell_of(at, cells) >= 0
@@ -200,7 +200,7 @@ def _march_example(generator: torch.Generator, size: int) -> tuple[object, ...]:
 def ways(
     queries: Float[Tensor, "q 3"], points: Float[Tensor, "n 3"], rows: Int64[Tensor, "q k"]
 ) -> Float[Tensor, "q k 3"]:
-    """From queries to their neighbours; zero where there is none."""
+    """Offsets from queries to their neighbours; zero where there is none."""
     to = points.index_select(0, rows.clamp_min(0).flatten()).view(*rows.shape, 3)
     return (to - queries[:, None]) * (rows >= 0)[..., None]
 
@@ -218,7 +218,7 @@ def chosen(
     place: Float[Tensor, "b d"],
     which: Int64[Tensor, "b s"],
 ) -> Float[Tensor, "b s 3"]:
-    """Points on rays at some of the places; zero where there is none."""
+    """Points on rays at selected samples; zero where there is none."""
     at = along(origin, direction, place.gather(-1, which.clamp_min(0)))
     return at * (which >= 0)[..., None]
 
@@ -230,7 +230,7 @@ def _key(cell: Int64[Tensor, "n 3"], bricks: list[int]) -> Int64[Tensor, "n"]:
 
 
 def _along(place: Int64[Tensor, "n"], axis: int, bricks: list[int]) -> Int64[Tensor, "n"]:
-    """What one coordinate of cells adds to their keys: keys are sums, for no bit is of two."""
+    """Contribution of one coordinate of cells to their keys; the bits of the three are disjoint."""
     apart = math.prod(bricks[axis + 1 :]) << BITS
     return (place >> HALF) * apart + ((place & SIDE - 1) << HALF * (2 - axis))
 
@@ -238,7 +238,7 @@ def _along(place: Int64[Tensor, "n"], axis: int, bricks: list[int]) -> Int64[Ten
 def _around(
     keys: Int64[Tensor, "m"], bricks: list[int], steps: Sequence[tuple[int, ...]]
 ) -> Iterator[Int64[Tensor, "_"]]:
-    """Keys of the cells some steps away, for a few cells at a time: all of them would be many."""
+    """Keys of the cells some steps away, for a limited number of cells at a time."""
     offsets = sorted({offset for step in steps for offset in step})
     for begin in range(0, len(keys), HELD):
         axes = enumerate(_cell_of_key(keys[begin : begin + HELD], bricks).unbind(-1))
@@ -259,7 +259,7 @@ def _cell_of_key(key: Int64[Tensor, "n"], bricks: list[int]) -> Int64[Tensor, "n
 
 
 def _cell_of(places: Float[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
-    """Number of the cell around each place, -1 where no point is near."""
+    """Number of the cell of each position, -1 where no point is near."""
     low = places.new_tensor(cells.origin)
     return _number(((places - low) / cells.edge).floor().long(), cells)
 
@@ -275,17 +275,17 @@ def _number(cell: Int64[Tensor, "*b 3"], cells: Cells) -> Int64[Tensor, "*b"]:
 def _nearest(
     queries: Float[Tensor, "q 3"], cells: Cells, most: int, radius: float
 ) -> Int64[Tensor, "q k"]:
-    """Rows of the nearest points of a few queries, by looking at all points of their windows."""
+    """Rows of the nearest points of a few queries, by comparing all points of their windows."""
     own = ((queries - queries.new_tensor(cells.origin)) / cells.edge).floor().long()
     steps = torch.tensor(window(cells.reach), device=queries.device)
     cell = _number(own[:, None] + steps, cells)  # [q, w]
     begin = cells.start.long()[cell.clamp_min(0)]
     count = torch.where(cell >= 0, cells.start.long()[cell.clamp_min(0) + 1] - begin, 0)
     slot = torch.arange(max(int(count.max()), 1) if len(cell) else 1, device=queries.device)
-    there = (slot < count[..., None]).flatten(1)
+    valid = (slot < count[..., None]).flatten(1)  # [q, w slots]
     item = (begin[..., None] + slot).flatten(1).clamp_max(len(cells.order) - 1)
     away = (cells.places.to(queries.dtype)[item] - queries[:, None]).square().sum(-1)
-    away = torch.where(there & (away < radius**2), away, torch.inf)
+    away = torch.where(valid & (away < radius**2), away, torch.inf)
     away = torch.nn.functional.pad(away, (0, most), value=torch.inf)
     item = torch.nn.functional.pad(item, (0, most))
     away, best = away.sort(dim=-1, stable=True)

@@ -1,9 +1,9 @@
-"""Drawing without replacement and without a table: a keyed shuffle of 0 ... n-1.
+"""Sampling without replacement and without a table: a keyed permutation of 0 ... n-1.
 
-A Feistel network of four rounds permutes the numbers of an even count of bits; numbers that land
-outside 0 ... n-1 are sent through again until they land inside ("cycle walking"). Any position
-of the shuffled order is computed by itself, so an epoch over a billion events needs no memory and
-position 7 million is as cheap as position 0.
+A Feistel network of four rounds permutes the numbers of an even count of bits; results outside 0
+... n-1 are permuted again until they are inside ("cycle walking"). Any position of the shuffled
+order is computed by itself, so an epoch over a billion events needs no memory, and position 7
+million is as cheap as position 0.
 
 Source: Black and Rogaway, *Ciphers with Arbitrary Finite Domains* (CT-RSA 2002).
 """
@@ -19,13 +19,13 @@ ROUNDS = 4
 def shuffled(
     position: Int64[np.ndarray, "*b"], n: int, *, seed: int, epoch: int
 ) -> Int64[np.ndarray, "*b"]:
-    """What stands at `position` when 0 ... n-1 are shuffled for this seed and epoch.
+    """The numbers at some positions of 0 ... n-1, shuffled for this seed and epoch.
 
     Args:
         position: 0 to n-1.
-        n: How many there are; at most 2^62.
+        n: Count of the numbers; at most 2^62.
         seed: The run's seed.
-        epoch: How often all of them have been drawn already; every epoch has its own order.
+        epoch: Every epoch has its own order.
 
     Raises:
         ValueError: A position is outside 0 ... n-1.

@@ -1,9 +1,8 @@
-"""Reading images and their smaller maps of features at pixels.
+"""Feature pyramids of images, sampled at pixels.
 
-Vocabulary: the *levels* of some images are maps `[n, h, w, f]`, channels last, the first of the
-images' own size and the others of any other. A pixel of the image is read from every level,
-bilinearly and clamped to it: equal to enlarging all maps to the size of the image first, but the
-enlarged maps never exist.
+The *levels* of some images are maps `[n, h, w, f]`, channels last, the first of the images' own
+size and the others of any size. A pixel of the image is sampled from every level, bilinearly with
+clamping: equal to upsampling all maps to the size of the image first, but without storing them.
 """
 
 from collections.abc import Sequence
@@ -16,23 +15,23 @@ from sharpfield.ops._dispatch import Op
 
 
 @Op
-def look_up(
+def sample_pyramid(
     xy: Float[Tensor, "m 2"],
     source: Int64[Tensor, "m"],
     levels: Sequence[Float[Tensor, "_n _h _w _f"]],
 ) -> Float[Tensor, "m f"]:
-    """What all levels hold at pixels, side by side.
+    """Features of all levels at pixels, concatenated.
 
     Args:
         xy: In pixels of the image, centres at +0.5.
-        source: The image of each.
+        source: Index of the image of each pixel.
         levels: Of all images.
     """
     height, width = levels[0].shape[1:3]
     return torch.cat([_bilinear(level, source, xy, (height, width)) for level in levels], -1)
 
 
-@look_up.exemplify
+@sample_pyramid.exemplify
 def _example(generator: torch.Generator, size: int) -> tuple[object, ...]:
     shapes = ((7, 9, 3), (4, 5, 6), (2, 3, 12))
     levels = [torch.randn(3, *shape, generator=generator) for shape in shapes]
@@ -50,10 +49,10 @@ def _bilinear(
     """One level at pixels of the image, whose height and width are `size`."""
     height, width = level.shape[1:3]
     rows = level.reshape(-1, level.shape[-1])
-    place = xy * xy.new_tensor([width / size[1], height / size[0]]) - 0.5
-    place = torch.minimum(place.clamp_min(0), place.new_tensor([width - 1, height - 1]))
-    low = place.detach().floor()
-    x, y = (place - low).unbind(-1)
+    at = xy * xy.new_tensor([width / size[1], height / size[0]]) - 0.5
+    at = torch.minimum(at.clamp_min(0), at.new_tensor([width - 1, height - 1]))
+    low = at.detach().floor()
+    x, y = (at - low).unbind(-1)
     column, row = low.long().unbind(-1)
     right, below = (column + 1).clamp_max(width - 1), (row + 1).clamp_max(height - 1)
     base = source * height

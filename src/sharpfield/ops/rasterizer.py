@@ -1,14 +1,14 @@
-"""Gaussians drawn as whole views: splats sorted by depth and blended from front to back.
+"""Rasterization of Gaussians: splats sorted by depth and blended from front to back.
 
-A *Gaussian* is an ellipsoid of light: a mean, a rotation (quaternion w x y z of any length), three
-scales, an opacity and a colour for each view. Seen by a camera, it becomes a *splat*: an ellipse
-whose opacity falls off as exp(-d/2), d the squared distance from its centre in units of its own
-spread (the *conic* is the inverse of that spread). A *canvas* is the part of a camera's image that
-is drawn, which may lie elsewhere for each view.
+A *Gaussian* has a mean, a rotation (quaternion w x y z of any length), three scales, an opacity and
+a colour for each view. Projected to a camera it is a *splat*: an ellipse whose opacity falls off as
+exp(-d/2), d the squared Mahalanobis distance from its centre (the *conic* is the inverse of its
+covariance). A *canvas* is the part of a camera's image that is rendered, at a position of its own
+for each view.
 
 Source: Zwicker et al., "EWA splatting" (2002); Kerbl et al., "3D Gaussian splatting for real-time
 radiance field rendering" (SIGGRAPH 2023); Yu et al., "Mip-Splatting" (CVPR 2024) for the opacity
-that pays for the widening (`antialiased`).
+compensation of the dilation (`antialiased`).
 """
 
 from dataclasses import dataclass
@@ -22,27 +22,28 @@ from sharpfield.core.camera import Camera
 from sharpfield.ops._dispatch import Op
 
 NEAR = 0.01
-"""Nearer Gaussians (along the optical axis, in units of the scene) are not drawn."""
+"""Gaussians nearer than this (along the optical axis, in units of the scene) are culled."""
 
 WIDEN = 0.1
-"""Added to the variance of every splat, in px^2, so that none falls between pixels. A pixel gathers
-light over a square, whose variance is 1/12 (Yu et al., "Mip-Splatting", CVPR 2024). The 0.3 of the
-first paper makes images softer than their pixels, which the scene then cannot make up for."""
+"""Added to the variance of every splat, in px^2 (dilation), so that none falls between pixels. A
+pixel integrates light over a square, whose variance is 1/12 (Yu et al., "Mip-Splatting", CVPR
+2024). The 0.3 of the first paper blurs images beyond their pixels, for which the scene cannot
+compensate."""
 
 FAINTEST = 1 / 255
-"""Where a splat stops less of the light than this, it is not drawn."""
+"""A splat with a smaller alpha at a pixel is skipped there."""
 
 MOST = 0.999
-"""No splat stops more of the light than this."""
+"""Largest alpha of a splat at a pixel."""
 
 ASIDE = 1.3
-"""The slope of the projection is taken no farther from the optical axis than this many times the
-image's corner; farther away its linearisation would explode."""
+"""The Jacobian of the projection is evaluated at most this many times as far from the optical axis
+as the image's corner; farther away the linearisation would diverge."""
 
 
 @dataclass(frozen=True)
 class Canvas:
-    """What is drawn: for each view, a part of the image of a pinhole camera."""
+    """What is rendered: for each view, a part of the image of a pinhole camera."""
 
     camera: Camera
     corner: Int64[Tensor, "v 2"]
@@ -50,10 +51,10 @@ class Canvas:
     size: tuple[int, int]
     """Width and height of the parts in pixels."""
     antialiased: bool = True
-    """Splats thinner than a pixel are drawn wider and fainter, not just wider."""
+    """Dilated splats get a lower opacity, so that their integral stays the same."""
 
     def __post_init__(self) -> None:
-        assert self.camera.lens == "pinhole", "splats are drawn for lenses without distortion"
+        assert self.camera.lens == "pinhole", "only cameras without distortion are rasterized"
 
     def reach(self) -> tuple[float, float]:
         """Largest x/z and y/z at which the projection is linearised."""
@@ -64,26 +65,26 @@ class Canvas:
 
 
 class Drawn(NamedTuple):
-    """What the canvas shows."""
+    """The rendered views."""
 
     light: Float[Tensor, "v h w c"]
-    """Sum of colours, on black."""
+    """Weighted sum of colours, on black."""
     depth: Float[Tensor, "v h w"]
-    """Sum of distances along the optical axis, weighed like the colours; divide by the opacity."""
+    """Sum of depths along the optical axis, weighted like the colours; divide by the opacity."""
     opacity: Float[Tensor, "v h w"]
-    """How much of the light from behind is stopped, 0...1."""
+    """Share of the light from behind that is absorbed, 0...1."""
 
 
 class Splats(NamedTuple):
-    """Gaussians as a view sees them."""
+    """Gaussians projected to views."""
 
     centre: Float[Tensor, "v n 2"]
     """In pixels of the canvas."""
     conic: Float[Tensor, "v n 3"]
-    """Elements xx, xy, yy of the inverse spread."""
+    """Elements xx, xy, yy of the inverse covariance."""
     depth: Float[Tensor, "v n"]
     opacity: Float[Tensor, "v n"]
-    """At the centre; 0 for what is too near or behind the camera."""
+    """At the centre; 0 for Gaussians too near or behind the camera."""
 
 
 @Op
@@ -124,21 +125,21 @@ def project(
     poses: Float[Tensor, "v 3 4"],
     canvas: Canvas,
 ) -> Splats:
-    """Gaussians as seen from poses; the arguments are those of `rasterize`."""
+    """Gaussians projected to views (EWA splatting); the arguments are those of `rasterize`."""
     camera = canvas.camera
     inward = poses[:, :, :3].mT  # camera from world
-    seen = torch.einsum("vij,vnj->vni", inward, means - poses[:, None, :, 3])
-    in_front = seen[..., 2] > NEAR
-    x, y, _ = seen.unbind(-1)
-    z = torch.where(in_front, seen[..., 2], 1.0)
-    focal = seen.new_tensor([camera.fx_px, camera.fy_px])
-    middle = seen.new_tensor([camera.cx_px, camera.cy_px]) - canvas.corner.to(seen)
-    centre = focal * torch.stack([x / z, y / z], -1) + middle[:, None]
+    points = torch.einsum("vij,vnj->vni", inward, means - poses[:, None, :, 3])  # [v, n, 3]
+    in_front = points[..., 2] > NEAR
+    x, y, _ = points.unbind(-1)
+    z = torch.where(in_front, points[..., 2], 1.0)
+    focal = points.new_tensor([camera.fx_px, camera.fy_px])
+    middle = points.new_tensor([camera.cx_px, camera.cy_px]) - canvas.corner.to(points)
+    centre = focal * torch.stack([x / z, y / z], -1) + middle[:, None]  # [v, n, 2]
 
     reach = canvas.reach()
     aside = [(side / z).clamp(-most, most) for side, most in zip((x, y), reach, strict=True)]
     zero = torch.zeros_like(z)
-    slope = torch.stack(
+    jacobian = torch.stack(  # of the projection, [v, n, 2, 3]; 3DGS eq. 5
         [
             torch.stack([focal[0] / z, zero, -focal[0] * aside[0] / z], -1),
             torch.stack([zero, focal[1] / z, -focal[1] * aside[1] / z], -1),
@@ -146,8 +147,8 @@ def project(
         -2,
     )
     axes = rotations(quaternions) * scales[:, None]
-    spread = slope @ inward[:, None] @ axes  # [v n 2 3]
-    covariance = spread @ spread.mT
+    root = jacobian @ inward[:, None] @ axes  # [v, n, 2, 3]
+    covariance = root @ root.mT  # [v, n, 2, 2]
     widened = covariance + WIDEN * torch.eye(2).to(covariance)
     determinant = widened.det()
     conic = torch.stack(
@@ -155,14 +156,14 @@ def project(
     ) / determinant.unsqueeze(-1)
     opacity = opacities.expand_as(determinant)
     if canvas.antialiased:
-        # The floor keeps the root's slope finite for splats seen edge-on.
+        # The floor keeps the root's gradient finite for splats seen edge-on.
         before = covariance.det().clamp_min(1e-6)
         opacity = opacity * (before / determinant).sqrt()
-    return Splats(centre, conic, seen[..., 2], torch.where(in_front, opacity, 0.0))
+    return Splats(centre, conic, points[..., 2], torch.where(in_front, opacity, 0.0))
 
 
 def _blend(splats: Splats, colours: Float[Tensor, "v n c"], canvas: Canvas) -> Drawn:
-    """The definition: every splat at every pixel, one after the other in order of depth."""
+    """Alpha compositing of every splat at every pixel, in order of depth (3DGS eq. 3)."""
     width, height = canvas.size
     rows = torch.arange(height).to(colours) + 0.5
     columns = torch.arange(width).to(colours) + 0.5
@@ -176,14 +177,14 @@ def _blend(splats: Splats, colours: Float[Tensor, "v n c"], canvas: Canvas) -> D
     order = splats.depth.argsort(dim=1, stable=True)
     alpha = alpha.gather(1, order[..., None, None].expand_as(alpha))
     all_light = alpha.new_ones(len(alpha), 1, height, width)
-    left = torch.cumprod(torch.cat([all_light, 1 - alpha], 1), 1)
-    weight = alpha * left[:, :-1]
+    transmittance = torch.cumprod(torch.cat([all_light, 1 - alpha], 1), 1)  # [v, n + 1, h, w]
+    weight = alpha * transmittance[:, :-1]
     colours = colours.gather(1, order[..., None].expand_as(colours))
     depth = splats.depth.gather(1, order)
     return Drawn(
         torch.einsum("vnhw,vnc->vhwc", weight, colours),
         torch.einsum("vnhw,vn->vhw", weight, depth),
-        1 - left[:, -1],
+        1 - transmittance[:, -1],
     )
 
 

@@ -1,8 +1,8 @@
-"""A few rows of a large table, with a gradient that is as small as what was taken.
+"""Indexing of rows of a large table, with a sparse gradient.
 
-The gradient of indexing a tensor is a tensor of zeros as large as the whole. Here it is *sparse*:
-it holds the rows that were taken and says which they are, so that neither memory nor an optimizer
-that knows of it (`training.row_adam`) ever touches the others.
+The gradient of indexing a tensor is a dense tensor as large as the whole. Here it is a sparse
+tensor of the indexed rows only, so that neither memory nor an optimizer with support for it
+(`training.optim.RowAdam`) touches the others.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 
 def take_rows(table: Float[Tensor, "n f"], rows: Int64[Tensor, "m"]) -> Float[Tensor, "m f"]:
-    """The rows of a table that are asked for.
+    """Rows of a table, with a sparse gradient.
 
     Args:
         table: Of any length.

@@ -1,4 +1,4 @@
-"""Step functions along a ray: where to look next, given where the light came from.
+"""Piecewise-constant functions along a ray, and importance sampling from them.
 
 Vocabulary: `depth [*b s]` are points of a ray in ascending order; `edges [*b s+1]` bound s
 intervals; `weights [*b s]` are the shares of the ray's light, see `ops.compositing`. A *position*
@@ -15,10 +15,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 FLOOR = 1e-5
-"""Added to the weights before sampling, so that every part of a ray can be visited."""
+"""Added to the weights before sampling, so that every part of a ray can be sampled."""
 
-THINNEST = 1e-5
-"""Cumulative weight below which a bin is not divided by its own."""
+LEAST_BIN = 1e-5
+"""Weight of a bin below which it is not divided by."""
 
 
 def random_positions(
@@ -44,7 +44,7 @@ def stratified_positions(
 
 
 def midpoints(depth: Float[Tensor, "*b s"]) -> Float[Tensor, "*b m"]:
-    """Half way between neighbours; m = s - 1."""
+    """Midpoints of neighbours; m = s - 1."""
     return (depth[..., 1:] + depth[..., :-1]) / 2
 
 
@@ -55,7 +55,7 @@ def jitter(depth: Float[Tensor, "*b s"], amount: Float[Tensor, "*b s"]) -> Float
 
     Args:
         depth: Ascending.
-        amount: 0 to 1: where in its bin each point goes; `random_positions` in training.
+        amount: New position of each point in its bin, 0 to 1; `random_positions` in training.
     """
     middle = midpoints(depth)
     lower = torch.cat([depth[..., :1], middle], -1)
@@ -69,21 +69,21 @@ def invert(
     weights: Float[Tensor, "*b s"],
     position: Float[Tensor, "*b m"],
 ) -> Float[Tensor, "*b m"]:
-    """Where the cumulative weight reaches each position; weight is spread evenly in an interval.
+    """Inverse of the cumulative weight, with weight uniform within each interval.
 
     Args:
         edges: Ascending; e = s + 1.
         weights: At least one above zero on each ray; they need not sum to one.
         position: 0 to 1.
     """
-    share = weights / weights.sum(-1, keepdim=True)
-    total = torch.cat([torch.zeros_like(share[..., :1]), share.cumsum(-1)], -1).contiguous()
-    right = torch.searchsorted(total, position.contiguous(), right=True)
+    pdf = weights / weights.sum(-1, keepdim=True)
+    cdf = torch.cat([torch.zeros_like(pdf[..., :1]), pdf.cumsum(-1)], -1).contiguous()  # [*b, e]
+    right = torch.searchsorted(cdf, position.contiguous(), right=True)
     below, above = (right - 1).clamp(min=0), right.clamp(max=edges.shape[-1] - 1)
-    low, high = total.gather(-1, below), total.gather(-1, above)
+    low, high = cdf.gather(-1, below), cdf.gather(-1, above)
     start, end = edges.gather(-1, below), edges.gather(-1, above)
     gap = high - low
-    gap = torch.where(gap < THINNEST, torch.ones_like(gap), gap)
+    gap = torch.where(gap < LEAST_BIN, torch.ones_like(gap), gap)
     return start + (position - low) / gap * (end - start)
 
 
@@ -93,10 +93,10 @@ def resample_points(
     weights: Float[Tensor, "*b s"],
     position: Float[Tensor, "*b m"],
 ) -> Float[Tensor, "*b m"]:
-    """New points where the light came from; the bins lie between midpoints of the old points.
+    """New points by importance; the bins are between midpoints of the old points.
 
-    The first and the last weight belong to half bins and are left out, as in the released NeRF
-    and everything built on it.
+    The first and the last weight belong to half bins and are left out, as in the released NeRF and
+    its successors.
 
     Args:
         depth: Ascending, at least three.
@@ -110,10 +110,10 @@ def resample_points(
 def merge(
     first: Float[Tensor, "*b s"], second: Float[Tensor, "*b m"]
 ) -> tuple[Float[Tensor, "*b t"], Int[Tensor, "*b t"]]:
-    """Both sets in ascending order, and where each came from in `cat([first, second])`.
+    """Both sets in ascending order, and the index of each in `cat([first, second])`.
 
-    The order lets a network see the samples unsorted; only its few outputs are then permuted
-    with `take_along`.
+    With the order, a network can process the samples unsorted, and only its few outputs are
+    permuted, by `take_along`.
     """
     depth, order = torch.cat([first, second], -1).sort(dim=-1, stable=True)
     return depth, order

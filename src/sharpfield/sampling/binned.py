@@ -1,8 +1,9 @@
-"""Events in windows of a fixed grid of times, as EvDNeRF learns from them.
+"""Event frames: events accumulated in windows of a fixed time grid, as EvDNeRF trains on them.
 
-Vocabulary: an *event frame* is one camera and one window of the grid; it holds the net number of
-events of each pixel. Half of a batch are pixels with events, half are any pixels, each of its own
-event frame. Pixels may be *blocks* of two by two, as the released code halves its data.
+Vocabulary: an *event frame* holds the net number of events of each pixel of one camera in one
+window of the grid. Half of a batch are pixels with events, half are any pixels, each from an event
+frame drawn at random. Pixels may be *blocks* of two by two, as the released code downsamples its
+data.
 
 Source: EvDNeRF (WACV 2024), supplement, and its released code.
 """
@@ -21,27 +22,27 @@ from sharpfield.core.seed import numpy_generator
 from sharpfield.events.index import EventIndex, counts, window
 
 Halved = Literal["no", "fairly", "as released"]
-"""Each pixel by itself; or blocks, whose sum over four is rounded towards zero, or downwards from
-sums of floating-point thresholds, which gives a block with one event to darker a whole one."""
+"""Single pixels; or blocks, whose sum over four is rounded towards zero, or, from sums of
+floating-point thresholds, downwards, which counts a whole event for a block with one OFF event."""
 
 FEWEST = 3
-"""Windows that are looked at from the first step."""
+"""Windows that are drawn from at the first step."""
 
 
 @dataclass(frozen=True)
 class BinnedTable:
-    """Event frames of several cameras, and where events are."""
+    """Event frames of several cameras, and the pixels with events."""
 
     net: Int32[np.ndarray, "v k h w"]
-    """Events to brighter minus those to darker."""
+    """ON events minus OFF events."""
     track: Int64[np.ndarray, "v"]
     clock: Clock
     block: int
-    """Pixels along the edge of what counts as one."""
+    """Pixels along the edge of a block."""
     busy: Int64[np.ndarray, "m"]
-    """Flat places in `net` with events, ascending."""
+    """Flat indices of `net` with events, ascending."""
     first: Int64[np.ndarray, "f"]
-    """Where each event frame's begin in `busy`; f = v k + 1."""
+    """Offset of each event frame in `busy`; f = v k + 1."""
     centre: tuple[float, float]
     """Mean row and column of the pixels with events in the first event frame."""
 
@@ -63,8 +64,8 @@ def binned_table(
 
     Args:
         index: The events; whole pixels, `height * width` of each camera.
-        clock: Of the capture, which is cut into the windows.
-        windows: How many.
+        clock: Of the capture, which is divided into the windows.
+        windows: Their number.
         size: Width and height of the sensor; even if halved.
         halved: Whether blocks of pixels count as one.
     """
@@ -85,11 +86,11 @@ def binned_table(
 
 
 RELEASED_THRESHOLD = 0.2
-"""What the released code takes one event for when it halves data, whatever the data set."""
+"""Threshold with which the released code downsamples data, whatever the data set."""
 
 
 def halve(net: Int32[np.ndarray, "*n h w"]) -> Int32[np.ndarray, "*n i j"]:
-    """A quarter of the sum of each block, rounded towards zero: alike for both signs."""
+    """A quarter of the sum of each block, rounded towards zero: symmetric in sign."""
     return np.trunc(_blocks(net) / 4).astype(np.int32)
 
 
@@ -108,18 +109,18 @@ def draw_binned(
     cropped: bool = False,
     device: torch.device | str = "cpu",
 ) -> EventPairs:
-    """Half pixels with events, half any pixels, each of an event frame drawn by itself.
+    """Half pixels with events, half any pixels, each from an event frame drawn at random.
 
     Event frames without events are not drawn for the first half.
 
     Args:
         table: Event frames.
-        count: How many pixels.
+        count: Number of pixels.
         seed: The run's seed.
         step: The training step.
-        until: Number of windows that are open, see `open_windows`.
-        cropped: Any pixel only of a box half as wide and high around the centre.
-        device: Where they are put.
+        until: Number of windows to draw from, see `open_windows`.
+        cropped: Only pixels of a box around the centre, half as wide and high as the image.
+        device: Of the result.
     """
     random = numpy_generator(seed, step, "binned")
     views, windows, height, width = table.net.shape
@@ -128,7 +129,7 @@ def draw_binned(
     busy = _busy_places(table, frames, (low, high)) if cropped else None
     half = count // 2
     held = np.diff(table.first)[frames]
-    if not held.any():  # the scene has not moved yet: there are only silent pixels to look at
+    if not held.any():  # nothing has moved yet: all pixels are without events
         half, place = 0, np.zeros(0, np.int64)
     elif busy is None:
         chosen = random.choice(frames[held > 0], half)
@@ -144,9 +145,9 @@ def draw_binned(
 
 
 def open_windows(step: int, windows: int, warm_up: int) -> int:
-    """How many windows, from the first on, are looked at: all after the warm-up.
+    """Number of windows, from the first, that are drawn from: all after the warm-up.
 
-    Source: the released code; one image more than windows, the last of which begins none.
+    Source: the released code, which counts one image more than there are windows.
     """
     if step >= warm_up:
         return windows
@@ -169,7 +170,7 @@ def _blocks(values: np.ndarray) -> np.ndarray:
 
 
 def _crop(table: BinnedTable) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First and last row and column of the box, moved so that it stays inside."""
+    """First and last row and column of the box, shifted to lie inside the image."""
     low, high = [], []
     for centre, cells in zip(table.centre, table.net.shape[2:], strict=True):
         half = cells // 4
@@ -182,7 +183,7 @@ def _crop(table: BinnedTable) -> tuple[tuple[int, int], tuple[int, int]]:
 def _busy_places(
     table: BinnedTable, frames: np.ndarray, crop: tuple[tuple[int, int], tuple[int, int]]
 ) -> Int64[np.ndarray, "m"]:
-    """Places with events inside the box, or anywhere if there are none."""
+    """Indices of pixels with events inside the box, or anywhere if there are none."""
     (top, left), (bottom, right) = crop
     _, _, height, width = table.net.shape
     frame, pixel = np.divmod(table.busy, height * width)

@@ -1,4 +1,4 @@
-"""Depth of a depth camera at the pixels of the frames."""
+"""Depth maps of a depth camera, resampled to the pixels of the frames."""
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64

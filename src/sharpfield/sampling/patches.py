@@ -1,7 +1,7 @@
 """Small patches of frames, drawn as pure functions of the seed and the step.
 
-A *patch* is p by p pixels that lie `apart` pixels from each other: with a wide distance, a kernel
-of few pixels on the patch stands for a long blur in the image. Patches of one pixel are pixels.
+A *patch* is p by p pixels with a spacing of `apart` pixels: with a wide spacing, a kernel of few
+pixels on the patch represents a long blur in the image. Patches of one pixel are pixels.
 
 Source: Hybrid Neural Rendering (CVPR 2023), whose patches are 8x8, 1 to 8 pixels apart.
 """
@@ -20,14 +20,14 @@ from sharpfield.sampling.pixels_and_pairs import PIXEL_CENTRE, PixelTable
 
 @dataclass(frozen=True)
 class PatchShape:
-    """What a patch looks like, and where it may be."""
+    """Size of patches, their spacing, and the border they keep off."""
 
     side: int = 8
     """Pixels along each edge."""
     apart: tuple[int, int] = (1, 8)
-    """Fewest and most pixels from one to the next, drawn for each patch."""
+    """Smallest and largest spacing in pixels, drawn for each patch."""
     border: int = 10
-    """Pixels at the edge of an image that are left alone."""
+    """Pixels at the edge of an image that are not used."""
 
 
 def draw_patches(
@@ -35,13 +35,13 @@ def draw_patches(
 ) -> Pixels:
     """Patches `[count, side, side]` of a few frames, an equal number of each.
 
-    Frames come in a shuffled order, all of them before one comes again.
+    Frames are drawn without replacement, in a shuffled order.
 
     Args:
         table: The pixels to draw from.
-        count: How many patches.
+        count: Number of patches.
         shape: Of each.
-        frames: Looked at in one step.
+        frames: Number of frames in one step.
         seed: The run's seed.
         step: The training step.
 
@@ -61,8 +61,8 @@ def draw_patches(
     random = numpy_generator(seed, step, "patches")
     frames = min(frames, len(table.frame))
     epoch, round_ = divmod(step, len(table.frame) // frames)
-    place = np.arange(round_ * frames, (round_ + 1) * frames, dtype=np.int64)
-    order = shuffled(place, len(table.frame), seed=number(seed, 0, "frames"), epoch=epoch)
+    rank = np.arange(round_ * frames, (round_ + 1) * frames, dtype=np.int64)
+    order = shuffled(rank, len(table.frame), seed=number(seed, 0, "frames"), epoch=epoch)
     frame = table.frame[order[np.arange(count) * frames // count]]
     step_px = random.integers(min(shape.apart[0], apart), apart + 1, size=count)
     reach = step_px * (shape.side - 1)

@@ -1,12 +1,11 @@
-"""What a training step looks at, as pure functions of the seed and the step.
+"""Training batches of pixels and of event pairs, as pure functions of the seed and the step.
 
-A *table* is prepared once and says what can be drawn; drawing from it picks a batch. Batches are
-drawn without replacement: step after step walks through a shuffled order, an epoch ends when
-fewer than a batch are left, and the next epoch has another order. Nothing is remembered between
-steps, so what step 700 looks at does not depend on how step 700 was reached.
+A *table* is prepared once and describes the population; drawing from it picks a batch. Batches are
+drawn without replacement: successive steps take successive parts of a shuffled order, an epoch ends
+when fewer than a batch are left, and the next epoch has another order. There is no state between
+steps, so the batch of step 700 does not depend on how step 700 was reached.
 
-Images and events stay where they are, as they are stored (and may be memory-mapped); only what
-is drawn is converted.
+Images and events stay as they are stored (and may be memory-mapped); only the batch is converted.
 """
 
 from dataclasses import dataclass
@@ -39,17 +38,17 @@ PIXEL_CENTRE = 0.5
 
 @dataclass(frozen=True)
 class PixelTable:
-    """Every pixel of the frames to learn from."""
+    """Every pixel of the training frames."""
 
     images: Shaped[np.ndarray, "n h w c"]
     """All frames of the capture, as stored."""
     white: float
     """The stored value that means 1."""
     frame: Int64[np.ndarray, "a"]
-    """The frames to learn from."""
+    """The training frames."""
     track: Int64[np.ndarray, "n"]
     time: Float32[np.ndarray, "n 2"]
-    """When each shutter opened and closed, 0...1 of the capture."""
+    """Opening and closing of each shutter, 0...1 of the capture."""
 
     def __len__(self) -> int:
         """Number of pixels."""
@@ -62,11 +61,11 @@ class PairTable:
 
     index: EventIndex
     chain: Int64[np.ndarray, "o"]
-    """Where each site's events begin in the population, see `ops.event_index.chains`."""
+    """Offset of each site's events in the population, see `events.index.chains`."""
     successors: int
-    """How many successors each event of the population has, at least."""
+    """Fewest successors of each event of the population."""
     site_xy: Float32[np.ndarray, "m 2"]
-    """Where each site looks, in pixels (centres at +0.5)."""
+    """Position of each site, in pixels (centres at +0.5)."""
     channel: Int8[np.ndarray, "m"] | None
     """Colour filter of each site; None on a mono sensor."""
     clock: Clock
@@ -104,8 +103,8 @@ def draw_pixels(
     """`count` pixels of the training frames, or all of them if there are fewer."""
     drawn = _drawn(len(table), count, seed=seed, step=step, stream="pixels")
     height, width = table.images.shape[1:3]
-    place, pixel = np.divmod(drawn, height * width)
-    frame, (row, column) = table.frame[place], np.divmod(pixel, width)
+    which, pixel = np.divmod(drawn, height * width)
+    frame, (row, column) = table.frame[which], np.divmod(pixel, width)
     open_close = torch.from_numpy(table.time[frame])
     value = table.images[frame, row, column].astype(np.float32) / np.float32(table.white)
     xy = np.stack([column, row], -1).astype(np.float32) + np.float32(PIXEL_CENTRE)
@@ -122,7 +121,7 @@ def draw_pixels(
 def pair_table(
     capture: Capture, index: EventIndex, *, successors: int = 1, half_pixel: bool = True
 ) -> PairTable:
-    """The events of a capture that have at least so many successors at their pixel.
+    """The events of a capture that have at least `successors` later events at their pixel.
 
     Args:
         capture: Must have events.
@@ -130,9 +129,8 @@ def pair_table(
         successors: At least 1. Chains of m pairs need m; accumulating `least` to `most` events
             needs `least + 1`.
         half_pixel: Whether rectified positions count from the centre of the first pixel, as ours
-            do (10.0 is the centre of pixel 10). Without it they are taken as positions from the
-            image's corner, as the released Ev-DeblurNeRF code does. Integer coordinates always
-            name pixels.
+            do (10.0 is the centre of pixel 10), or from the image's corner, as in the released
+            Ev-DeblurNeRF code. Integer coordinates are always pixel indices.
 
     Raises:
         CaptureError: There are no such events, or the colour of a site is not known.
@@ -177,7 +175,7 @@ def draw_pairs(
         seed: The run's seed.
         step: The training step.
         accumulate: Fewest and most events that a pair spans; (0, 0) means the next event.
-        device: Where the pairs are put.
+        device: Of the result.
 
     Source: Ev-DeblurNeRF (CVPR 2024), event-by-event supervision and the study of fig. 4.
     """
@@ -209,7 +207,7 @@ def draw_chains(
         length: Pairs per chain.
         seed: The run's seed.
         step: The training step.
-        device: Where the pairs are put.
+        device: Of the result.
     """
     assert table.successors >= length, f"table of {table.successors} successors, chains of {length}"
     drawn = _drawn(len(table), count, seed=seed, step=step, stream="chains")
@@ -222,10 +220,10 @@ def draw_chains(
 def draw_silent(
     table: PairTable, count: int, *, seed: int, step: int, device: Device = "cpu"
 ) -> EventPairs:
-    """`count` pairs of instants between which the pixel stayed silent.
+    """`count` pairs of instants without any event of the pixel in between.
 
-    Each says that log intensity changed by less than a threshold. Pixels and times are uniform;
-    both instants lie between the same two events, or before the first or after the last.
+    Log intensity changed by less than a threshold between them. Pixels and times are uniform; both
+    instants are between the same two events, or before the first or after the last.
     """
     index, random = table.index, numpy_generator(seed, step, "silent")
     begin, end = int(index.t_us.min()), int(index.t_us.max())
@@ -257,7 +255,7 @@ def pairs_between(
     """Pairs of the events at positions `first` and `last` of the same sites."""
     t_us = table.index.t_us
     start, end = table.clock.unit(t_us[first]), table.clock.unit(t_us[last])
-    # The first event is the reference; the second and those between are what happened since.
+    # The first event is the reference level; the second and those in between count.
     return pairs_of(table, site, (start, end), counts(table.index, first + 1, last + 1))
 
 
@@ -267,7 +265,7 @@ def pairs_of(
     time: tuple[np.ndarray, np.ndarray],
     darker_brighter: tuple[np.ndarray, np.ndarray],
 ) -> EventPairs:
-    """Pairs of two unit times at sites, and how many events there were of each sign."""
+    """Pairs of two times (0...1) at sites, from the numbers of OFF and ON events."""
     darker, brighter = darker_brighter
     channel = None if table.channel is None else table.channel[site].astype(np.int64)
     return EventPairs(

@@ -1,11 +1,11 @@
-"""Events counted in windows of time, of any pixel of any camera: exact, whatever the window.
+"""Events counted in windows of time, of any pixel of any camera.
 
 Vocabulary: a *window* is a pixel and two instants; its counts are those of the events after the
-first instant up to and including the second. Its length is drawn evenly in the logarithm, so that
-short windows are as frequent as long ones. A *span* is a window that begins and ends with an event
-of its pixel. At these instants the reference level of the pixel equals its light, so that the
-counts of a span measure the change of light exactly, while at the ends of other windows up to a
-threshold is left over.
+first instant up to and including the second. Its length is log-uniform, so that short windows are
+as frequent as long ones. A *span* is a window that begins and ends with an event of its pixel. At
+these instants the reference level of the pixel equals its log light, so that the counts of a span
+measure the change of light exactly, while at the ends of other windows there is an unknown rest of
+up to a threshold.
 
 Source: EvDNeRF (WACV 2024) for windows of half event pixels and half random pixels over all views;
 Robust e-NeRF (ICCV 2023) for reference levels.
@@ -24,17 +24,17 @@ from sharpfield.sampling.pixels_and_pairs import Device, PairTable, pairs_betwee
 
 @dataclass(frozen=True)
 class Lengths:
-    """How long windows are, and which part of the recording they lie in; in shares of it."""
+    """Lengths of windows, and the part of the recording they are in; in fractions of it."""
 
     shortest: float = 1 / 256
-    """Share of the recording that the shortest window lasts."""
+    """Length of the shortest window."""
     longest: float = 1.0
-    """Share of the recording that the longest window lasts."""
+    """Length of the longest window."""
     until: float = 1.0
-    """Windows lie between the beginning and this."""
+    """Windows end before this time."""
 
     def draw(self, random: np.random.Generator, count: int) -> np.ndarray:
-        """Evenly in the logarithm."""
+        """Lengths, log-uniform."""
         low, high = np.log(min(self.shortest, self.until)), np.log(min(self.longest, self.until))
         return np.exp(low + random.random(count) * (high - low))
 
@@ -53,13 +53,13 @@ def draw_windows(
 
     Args:
         table: Of the events.
-        count: How many.
+        count: Their number.
         lengths: Of the windows.
         seed: The run's seed.
         step: The training step.
-        busy: Share of the windows that hold an event for certain: an event is drawn, then a window
-            around it. The others are of any pixel at any time.
-        device: Where they are put.
+        busy: Fraction of the windows that contain an event: an event is drawn, then a window around
+            it. The others are of any pixel at any time.
+        device: Of the result.
     """
     random = numpy_generator(seed, step, "windows")
     clock = table.clock
@@ -82,7 +82,7 @@ def draw_spans(
 ) -> EventPairs:
     """`count` spans: an event and a later one of its pixel.
 
-    How many events later is drawn evenly in the logarithm.
+    The number of events in between is log-uniform.
     """
     random = numpy_generator(seed, step, "spans")
     rank = random.integers(len(table), size=count)
@@ -93,7 +93,7 @@ def draw_spans(
 
 
 def _any_site(index: EventIndex, random: np.random.Generator, count: int) -> Int64[np.ndarray, "b"]:
-    """Sites of the cameras that reported anything at all: others may not have been recording."""
+    """Random sites of the cameras with any events: others may not have been recording."""
     each = index.sites // index.tracks
     reported = np.diff(index.offset[:: max(each, 1)]) > 0
     track = random.choice(np.flatnonzero(reported), size=count)

@@ -10,7 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from jaxtyping import Float32, Float64
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.events import EventStream, merged
 from sharpfield.core.frames import Exposure, Frames
@@ -19,9 +22,9 @@ from sharpfield.core.seed import number
 from sharpfield.geometry.trajectory import Still, Tracks
 from sharpfield.simulation.cameras.motions import CameraPath, stamped
 from sharpfield.simulation.cameras.rigs import RING_FOCAL, StillCamera, Views, ring
-from sharpfield.simulation.scenes.flow import depth_and_flow
 from sharpfield.simulation.scenes.moving import moving_scene
 from sharpfield.simulation.scenes.static import Scene
+from sharpfield.simulation.scenes.surfaces import meet
 from sharpfield.simulation.static_capture import Rig, Timing, record
 
 MOVING_RIG = Rig(size=(128, 128), focal_of_width=RING_FOCAL)
@@ -31,6 +34,12 @@ is for testing."""
 
 MAPS = ("threshold_on_map", "threshold_off_map")
 """Notes that give a threshold for each pixel."""
+
+
+MOMENT_US = 100
+"""Time by which a point is followed to each side."""
+FARAWAY = 1e6
+"""Depth of the background, for its flow when the camera rotates."""
 
 RING = ring(8, held_out=4)
 
@@ -157,3 +166,36 @@ def _split(frames: Frames, held_out: np.ndarray, timing: Timing) -> Split:
     every = timing.test_every or 1
     chosen = test % timing.frames % every == every // 2
     return Split(np.flatnonzero(~held_out[frames.track]), test[chosen])
+
+
+def depth_and_flow(
+    place: Scene, camera: Camera, path: CameraPath, t_us: int
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w 2"]]:
+    """True depth along the camera's axis (infinite in the background), and flow in px per second.
+
+    The flow of a pixel is that of the surface point at its centre: the point is moved with its body
+    to a moment before and after, and projected to the camera at these times.
+    """
+    pose = path.poses(np.array([t_us]))[0]
+    across = camera.direction(camera.grid().double()).reshape(-1, 3).numpy()
+    across = np.ascontiguousarray(across / across[:, 2:]) @ pose[:, :3].T
+    time_s = 1e-6 * t_us
+    which, depth = meet(place.at(time_s), pose[None, :, 3], across, time_s, 1 / camera.fx_px)
+    points = pose[:, 3] + np.where(which >= 0, depth, FARAWAY)[:, None] * across
+    before, after = (
+        _projected(camera, path, place.followed(points, which, time_s, 1e-6 * t), t)
+        for t in (t_us - MOMENT_US, t_us + MOMENT_US)
+    )
+    shape = camera.height, camera.width
+    flow = (after - before) / (2e-6 * MOMENT_US)
+    visible = np.where(which >= 0, depth, np.inf).astype(np.float32)
+    return visible.reshape(shape), flow.reshape(*shape, 2).astype(np.float32)
+
+
+def _projected(
+    camera: Camera, path: CameraPath, points: Float64[np.ndarray, "n 3"], t_us: int
+) -> Float64[np.ndarray, "n 2"]:
+    """Projection of points to the camera at a time."""
+    pose = path.poses(np.array([t_us]))[0]
+    inside = (points - pose[:, 3]) @ pose[:, :3]
+    return camera.project(torch.from_numpy(inside)).numpy()

@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast._kernel import empty, kernel, memory, share, spread
-from sharpfield.ops.pyramid import look_up
+from sharpfield.ops.pyramid import sample_pyramid
 
 
-@look_up.accelerate("cpu", needs="numba")
+@sample_pyramid.accelerate("cpu", needs="numba")
 def _(
     xy: Float[Tensor, "m 2"],
     source: Int64[Tensor, "m"],

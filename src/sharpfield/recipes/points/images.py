@@ -19,7 +19,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.frames import DepthMaps
 from sharpfield.core.rays import Rays
 from sharpfield.fields.image_features import MAPS, FeatureExtractor, Merging, Mixing
-from sharpfield.ops.pyramid import look_up
+from sharpfield.ops.pyramid import sample_pyramid
 from sharpfield.rendering.points import ShadedSamples
 
 MIN_DEPTH = 1e-6
@@ -298,7 +298,7 @@ class ImageBranch(nn.Module):
             if self.options.interpolation == "nearest"
             else projection.xy
         )
-        looked = look_up(xy.flatten(0, 1), source.flatten(), ready.levels)
+        looked = sample_pyramid(xy.flatten(0, 1), source.flatten(), ready.levels)
         looked = looked.view(*source.shape, looked.shape[-1])
         with_images = ~ready.alone[asked.ray][:, None]
         merged, weight = self.merging(looked, feature, projection.change, projection.visible)

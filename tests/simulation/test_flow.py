@@ -5,7 +5,7 @@ import torch
 from sharpfield.core.camera import Camera
 from sharpfield.simulation.cameras.motions import Motion, motion
 from sharpfield.simulation.cameras.rigs import CarriedCamera, StillCamera, ring_pose
-from sharpfield.simulation.scenes.flow import depth_and_flow
+from sharpfield.simulation.moving_capture import depth_and_flow
 from sharpfield.simulation.scenes.moving import MOVING_SCENES, moving_scene
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.static_capture import Rig, view
