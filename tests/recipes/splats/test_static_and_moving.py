@@ -130,6 +130,20 @@ def test_the_whole_calibration_is_learned_at_once(name: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_to_refine_a_camera_frames_and_events_take_turns(name: str):
+    """Views at the instants of frames cannot tell by how much the events' clock is late."""
+    recipe = replace(recipe_named(name)(), steps=STEPS)
+    made = recipe.presets.apply(["refine"], recipe).build(blurred(), 0)
+    late = range(made.heaviest_step, STEPS)
+    kinds = {step: "frames" if "frames" in made.draw(step) else "events" for step in late}
+    assert set(kinds.values()) == {"frames", "events"}
+    assert all(("events" in made.draw(step)) == (kinds[step] == "events") for step in late)
+    made.losses(made.draw(STEPS - 1), STEPS - 1)["events"].backward()
+    # Cameras that do not move see a static scene alike at all times.
+    assert bool(made.calibration.offset_steps.grad.any()) == (made.scene.moving is not None)
+
+
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("response", ["fixed", "residual"])
 def test_log_light_is_what_events_are_compared_with(name: str, response: str):
     """Event scores of every recipe use the floor and the response that it was trained with."""

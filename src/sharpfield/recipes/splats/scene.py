@@ -48,8 +48,11 @@ class LearningRates:
     means: float = 0.016
     """In units of the normalised scene, whose nearest depth is 4/3; falls to a hundredth."""
     quaternions: float = 2e-3
+    """Of rotations, as quaternions of any length."""
     log_scales: float = 1e-2
+    """Of the natural log of scales."""
     opacities: float = 0.1
+    """Of the logit of opacities."""
     colours: float = 5e-3
     """Of the harmonics of SH degree 0; the higher ones learn 5 times slower."""
 
