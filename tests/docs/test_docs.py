@@ -5,9 +5,11 @@ note what they were called with.
 """
 
 import ast
+import contextlib
 import functools
 import importlib
 import inspect
+import io
 import re
 import shlex
 from collections.abc import Callable, Iterator
@@ -16,22 +18,37 @@ from typing import Any
 
 import pytest
 
+import sharpfield
 from sharpfield.cli import commands as command_line
-from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named
-from sharpfield.recipes.settings.options import changed
+from sharpfield.recipes.settings.options import changed, options_of
 from sharpfield.recipes.settings.presets import presets_of
 
 ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "src" / "sharpfield"
+ROOMS = {path.name for path in SOURCE.iterdir() if path.is_dir()}
+TOPS = {"src", "docs", "tests", "benchmarks", "examples"}
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "notebook.md"]
 PAGES += sorted((ROOT / "docs").rglob("*.md"))
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^ {4,}(sharpfield [a-z].*)$", re.MULTILINE)
 INLINE = re.compile(r"`(sharpfield [^`]+)`")
-CHANGES = re.compile(r"`--change ([^`]+)`")
+SPAN = re.compile(r"`([^`\n]+)`")
+FILE = re.compile(r"([\w./-]+\.(?:py|md|ipynb|json))(?:: (.+))?")
+FOLDER = re.compile(r"[a-z_]+(?:/[a-z_]+)*/")
+DOTTED = re.compile(r"([a-z_]+)((?:\.\w+)+)")
+MODULE = re.compile(r"python (?:-m ([\w.]+)|([\w/]+\.py))")
+FLAG = re.compile(r"--([a-z][\w.-]*)")
 LINK = re.compile(r"\]\(([^)\s]+)\)|<img[^>]* src=\"([^\"]+)\"")
 COMMAND = re.compile(r"^(sharpfield [a-z].*)$", re.MULTILINE)
+
+FILES = {".h5", ".npz", ".npy", ".toml", ".json", ".png", ".html", ".csv", ".txt", ".py", ".ply"}
+TOLD = ("runs/",)
+"""Folders of examples, where a page names files that commands write."""
+OTHERS = {"pip", "pytest", "venv"}
+"""Modules of other packages that pages run."""
+NOUNS = {"capture"}
 
 Call = tuple[str, dict[str, Any]]
 
@@ -111,19 +128,41 @@ def test_inline_commands_name_options_that_exist(
         assert {word for word in words if word.startswith("--")} <= known, line
 
 
+def spans(page: Path) -> list[str]:
+    """What stands between single backticks, outside of blocks."""
+    return SPAN.findall(FENCE.sub("", page.read_text()))
+
+
+@functools.cache
+def recipe_options() -> frozenset[str]:
+    """Options of all recipes, with those that other names have as flags."""
+    return frozenset(option for kind in RECIPES.values() for option in options_of(kind()))
+
+
+@functools.cache
+def flags() -> frozenset[str]:
+    """Flags of all commands and recipes, with `_` for `-`."""
+    found = set(recipe_options())
+    for command in command_line.COMMANDS:
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
+            command_line.main([command, "--help"])
+        found |= {flag.replace("-", "_").rstrip(".") for flag in FLAG.findall(said.getvalue())}
+    return frozenset(found)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
-def test_changes_name_numbers_of_a_recipe(page: Path) -> None:
-    for change in CHANGES.findall(page.read_text()):
-        if "NAME" not in change:
-            assert any(can_be_changed(kind(), change) for kind in RECIPES.values()), change
+def test_flags_exist(page: Path) -> None:
+    """Such as `--sampling.views 5`, of a command or a recipe."""
+    for span in spans(page):
+        if span.startswith("--"):
+            unknown = {flag.replace("-", "_") for flag in FLAG.findall(span)} - flags()
+            assert not unknown, f"{name(page)}: {span}"
 
 
-def can_be_changed(recipe: object, change: str) -> bool:
-    try:
-        changed(recipe, tuple(change.split()))
-    except OptionError:
-        return False
-    return True
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_nothing_is_changed_in_the_old_way(page: Path) -> None:
+    assert not re.search(r"--change \w+\.?\w*=", page.read_text()), "options are flags"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -146,11 +185,33 @@ def anchors(page: Path) -> set[str]:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_python_imports_what_there_is(page: Path) -> None:
     for block in blocks(page, "python"):
-        for node in ast.walk(ast.parse(block)):
+        if page.name == "api.md":  # signatures and values, no programs
+            continue
+        tree = ast.parse(block)
+        for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sharpfield"):
+                assert not (node.module or "").startswith("sharpfield.cli"), name(page)
                 module = importlib.import_module(node.module or "")
                 missing = [alias.name for alias in node.names if not hasattr(module, alias.name)]
                 assert not missing, f"{name(page)}: {node.module} has no {', '.join(missing)}"
+            if isinstance(node, ast.Attribute) and ast.unparse(node).startswith("sf."):
+                assert resolves(ast.unparse(node)), f"{name(page)}: {ast.unparse(node)}"
+
+
+def resolves(dotted: str) -> bool:
+    """Whether `sf.events.edi`, or `events.counts.count` of the package, is there."""
+    first, *rest = dotted.split(".")
+    found: Any = sharpfield
+    for part in rest if first == "sf" else [first, *rest]:
+        if not re.fullmatch(r"\w+", part):
+            return False
+        if not hasattr(found, part):
+            try:
+                importlib.import_module(f"{found.__name__}.{part}")
+            except (ImportError, AttributeError):
+                return False
+        found = getattr(found, part)
+    return True
 
 
 def test_the_tree_of_the_readme_exists() -> None:
@@ -168,10 +229,77 @@ def test_the_tree_of_the_readme_exists() -> None:
     assert not unshown, f"not in the README: {', '.join(path.name for path in unshown)}"
 
 
-def test_files_named_in_tables_exist() -> None:
-    """Paths such as `formation/mixing.py` in backticks, from the package, or from the top."""
-    places = (ROOT, ROOT / "src" / "sharpfield", ROOT / "src" / "sharpfield" / "recipes")
-    for page in PAGES:
-        for path in re.findall(r"`([a-z_]+(?:/[a-z_0-9]+)*\.py)\b", page.read_text()):
-            beside = (*places, *(ROOT / "src" / "sharpfield").iterdir())
-            assert any((place / path).exists() for place in beside), f"{name(page)}: {path}"
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_quoted_files_exist(page: Path) -> None:
+    """`formation/mixing.py: mix, mix_of_few`: from the package or the top, with what it defines."""
+    for span in spans(page):
+        match = FILE.fullmatch(span)
+        if match is None or match[1].startswith(TOLD):
+            continue
+        file = next((one / match[1] for one in (SOURCE, ROOT) if (one / match[1]).exists()), None)
+        if match[1].endswith(".json") and file is None and "/" not in match[1]:
+            continue  # a file that a command writes
+        assert file is not None, f"{name(page)}: {span}"
+        for one in (match[2] or "").split(", "):
+            assert not one or one in defined(file), f"{name(page)}: {span}"
+
+
+@functools.cache
+def defined(file: Path) -> frozenset[str]:
+    """Names that a module defines at its top, and `Class.name`."""
+    found = set()
+    for node in ast.parse(file.read_text()).body:
+        names = named(node)
+        found |= names
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{one}" for inner in node.body for one in named(inner)}
+    return frozenset(found)
+
+
+def named(node: ast.AST) -> set[str]:
+    """What a statement gives a name to."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return {node.name}
+    if isinstance(node, ast.Assign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        return {
+            one.id for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)
+        }
+    return set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_quoted_folders_exist(page: Path) -> None:
+    """`captures/layouts/`, where the first name is one of our folders."""
+    for span in spans(page):
+        if FOLDER.fullmatch(span) and span.split("/")[0] in {*ROOMS, *TOPS}:
+            assert (SOURCE / span).is_dir() or (ROOT / span).is_dir(), f"{name(page)}: {span}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_quoted_names_exist(page: Path) -> None:
+    """`sf.events.edi`, `geometry.se3.exp`, and options of recipes such as `volume.kind=mlp`."""
+    groups = {option.split(".")[0] for option in recipe_options() if "." in option}
+    for span in spans(page):
+        match = DOTTED.match(span.partition("=")[0])
+        if match is None or Path(match[0]).suffix in FILES or "/" in span:
+            continue
+        if match[1] == "sf" or match[1] in ROOMS or match[1] in groups and "=" in span:
+            known = match[0] in recipe_options() or resolves(match[0])
+            assert known or match[1] in NOUNS, f"{name(page)}: {span}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_quoted_programs_exist(page: Path) -> None:
+    """`python -m benchmarks.decode`, `python examples/edi_davis240c.py FOLDER`."""
+    for module, file in MODULE.findall(page.read_text()):
+        path = file or module.replace(".", "/") + ".py"
+        package = ROOT / module.replace(".", "/") / "__main__.py"
+        assert module in OTHERS or (ROOT / path).exists() or module and package.exists(), path
+
+
+def test_files_and_names_that_are_missing_are_noticed(tmp_path: Path) -> None:
+    assert "mix_of_few" in defined(SOURCE / "formation" / "mixing.py")
+    assert "Capture.depth" in defined(SOURCE / "core" / "capture.py")
+    assert not resolves("events.nothing.there") and resolves("events.counts")
+    assert "sampling.views" in recipe_options() and "sampling.looks" not in recipe_options()
