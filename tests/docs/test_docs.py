@@ -38,11 +38,14 @@ SPAN = re.compile(r"`([^`\n]+)`")
 FILE = re.compile(r"([\w./-]+\.(?:py|md|ipynb|json))(?:: (.+))?")
 FOLDER = re.compile(r"[a-z_]+(?:/[a-z_]+)*/")
 DOTTED = re.compile(r"([a-z_]+)((?:\.\w+)+)")
-MODULE = re.compile(r"python (?:-m ([\w.]+)|([\w/]+\.py))")
+PROGRAM = re.compile(r"python (?:-m ([\w.]+)|([\w/]+\.py))(.*)")
 FLAG = re.compile(r"--([a-z][\w.-]*)")
+ARGUMENT = re.compile(r"add_argument\(\s*\"--([\w-]+)\"")
 LINK = re.compile(r"\]\(([^)\s]+)\)|<img[^>]* src=\"([^\"]+)\"")
 COMMAND = re.compile(r"^(sharpfield [a-z].*)$", re.MULTILINE)
 
+PROGRAMS = [*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "examples").glob("*.py")]
+PROGRAMS += [ROOT / "tests" / "recordings" / "fuzz.py", ROOT / "docs" / "make_api.py"]
 FILES = {".h5", ".npz", ".npy", ".toml", ".json", ".png", ".html", ".csv", ".txt", ".py", ".ply"}
 TOLD = ("runs/",)
 """Folders of examples, where a page names files that commands write."""
@@ -119,6 +122,8 @@ def test_inline_commands_name_options_that_exist(
     monkeypatch.setenv("COLUMNS", "200")
     for line in INLINE.findall(page.read_text()):
         words = line.split()
+        if words[1] in ("--help", "--version"):
+            continue
         if words[1] not in command_line.COMMANDS:
             assert not words[1].islower(), line  # COMMAND and the like stand for any
             continue
@@ -148,7 +153,14 @@ def flags() -> frozenset[str]:
         with contextlib.redirect_stdout(said), pytest.raises(SystemExit):
             command_line.main([command, "--help"])
         found |= {flag.replace("-", "_").rstrip(".") for flag in FLAG.findall(said.getvalue())}
+    for program in PROGRAMS:
+        found |= arguments_of(program)
     return frozenset(found)
+
+
+def arguments_of(program: Path) -> set[str]:
+    """Flags that a benchmark or an example takes."""
+    return {flag.replace("-", "_") for flag in ARGUMENT.findall(program.read_text())}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -156,13 +168,14 @@ def test_flags_exist(page: Path) -> None:
     """Such as `--sampling.views 5`, of a command or a recipe."""
     for span in spans(page):
         if span.startswith("--"):
-            unknown = {flag.replace("-", "_") for flag in FLAG.findall(span)} - flags()
+            named = {flag for flag in FLAG.findall(span) if flag.islower()}  # NAME stands for any
+            unknown = {flag.replace("-", "_") for flag in named} - flags()
             assert not unknown, f"{name(page)}: {span}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_nothing_is_changed_in_the_old_way(page: Path) -> None:
-    assert not re.search(r"--change \w+\.?\w*=", page.read_text()), "options are flags"
+    assert not re.search(r"--change [a-z]", page.read_text()), "options are flags"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -291,11 +304,15 @@ def test_quoted_names_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_quoted_programs_exist(page: Path) -> None:
-    """`python -m benchmarks.decode`, `python examples/edi_davis240c.py FOLDER`."""
-    for module, file in MODULE.findall(page.read_text()):
-        path = file or module.replace(".", "/") + ".py"
-        package = ROOT / module.replace(".", "/") / "__main__.py"
-        assert module in OTHERS or (ROOT / path).exists() or module and package.exists(), path
+    """`python -m benchmarks.decode --runs 7`, with the flags that they take."""
+    for module, file, rest in PROGRAM.findall(page.read_text()):
+        if module in OTHERS:
+            continue
+        path = ROOT / (file or module.replace(".", "/") + ".py")
+        path = path if path.exists() else path.with_suffix("") / "__main__.py"
+        assert path.exists(), f"{name(page)}: {module or file}"
+        given = {flag.replace("-", "_") for flag in FLAG.findall(rest.partition("`")[0])}
+        assert given <= arguments_of(path), f"{name(page)}: {module or file}{rest}"
 
 
 def test_files_and_names_that_are_missing_are_noticed(tmp_path: Path) -> None:
