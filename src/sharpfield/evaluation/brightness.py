@@ -91,6 +91,7 @@ def fit_brightness(
 
 def fit_log_affine(light: Sequence[Image], stored: Sequence[Image]) -> LogAffine:
     """The line per channel with the least squared error in log intensity, over all images."""
+    # [all pixels, c] of all images
     x = torch.cat([image.flatten(0, 1) for image in light]).double().clamp_min(DARK).log()
     y = torch.cat([image.flatten(0, 1) for image in stored]).double().clamp_min(DARK).log()
     centred = x - x.mean(0)

@@ -279,12 +279,12 @@ def _error(
         rows = moved_rows(view.rows, view.start, pose)
         rendered = model.draw_views(whole(camera, pose, view.time, rows))[0, row, column, 0]
     else:
-        xy = torch.stack([column, row], -1) + 0.5
+        xy = torch.stack([column, row], -1) + 0.5  # [q, 2], pixel centres
         ones = torch.ones_like(xy[:, 0])
         rendered = model.render(
             cast(camera, pose.expand(len(pixels), 3, 4), xy, view.time * ones, ones)
         )
-    stored = view.image[row, column]
+    stored = view.image[row, column]  # [q, c]
     error = (model.encode(rendered.rgb) - stored).square().mean()
     if rendered.coarse is not None:
         error = error + (model.encode(rendered.coarse.rgb) - stored).square().mean()

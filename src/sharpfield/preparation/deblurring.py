@@ -125,7 +125,7 @@ def _joint(
             capture.needed_frames.exposure.window(int(frame)), np.array([middle]), thresholds
         )
         sharp.append(latent(linear_light(capture, int(frame), tone), path, 0))
-    sharp = torch.stack(sharp)
+    sharp = torch.stack(sharp)  # [n, h, w, c]
     observed = sharp if motion.channel is not None else luma(sharp)[..., None]
     gaps = [
         motion.between(int(start), int(end), thresholds)

@@ -71,21 +71,18 @@ class EventChange:
     """Mean polarity of the next event, second exposure minus first."""
 
 
-def find_exposure_pairs(
-    capture: Capture, *, most: int, encoding: str | None = None
-) -> list[ExposurePair]:
+def find_exposure_pairs(capture: Capture, *, most: int) -> list[ExposurePair]:
     """Pairs of consecutive exposures that are covered by events, spread over the capture.
 
     Args:
         capture: With frames and events.
         most: Largest number of pairs.
-        encoding: Relation of stored values to light, if not that of the frames.
 
     Raises:
         CaptureError: There are no events, or not two frames of one camera.
     """
     frames, events = capture.needed_frames, capture.needed_events
-    pairs = neighbours(capture, np.arange(len(frames)))
+    pairs = neighbours(capture, np.arange(len(frames)))  # [m, 2]
     if not len(pairs) or not len(events):
         raise CaptureError(
             "comparing frames with events needs two frames of one camera, and events",
@@ -95,7 +92,7 @@ def find_exposure_pairs(
     opens, closes = frames.exposure.open_us[pairs[:, 0]], frames.exposure.close_us[pairs[:, 1]]
     inside = pairs[(opens >= events.t_us[0]) & (closes <= events.t_us[-1])]
     chosen = evenly_spread(inside if len(inside) else pairs, most)
-    tone = tone_of(encoding or frames.encoding)
+    tone = tone_of(frames.encoding)
     return [_pair(capture, (int(i), int(j)), tone) for i, j in chosen]
 
 
@@ -129,7 +126,7 @@ def change_by_events(
         sites: Sites of the camera of the frames.
         thresholds: To darker and to brighter.
     """
-    found = np.zeros((len(sites), 5))
+    found = np.zeros((len(sites), 5))  # change, count off, count on, last, next
     _sum_events(
         *(sites, index.offset, index.t_us, index.p, weight, pair.windows_us, thresholds, found)
     )

@@ -204,7 +204,7 @@ class Normal:
         growth = _spread(fit.residual, _activity(equations.by_events(fit.terms), fit.terms))[1]
         tukey = (1 - np.clip(np.abs(fit.residual) / (TUKEY * fit.spread), 0, 1) ** 2) ** 2
         weighted = (tukey / (noise + growth * activity))[:, None] * instruments
-        order = np.argsort(equations.tile, kind="stable")
+        order = np.argsort(equations.tile, kind="stable")  # sums by tile: [e, 7] -> [t, 7]
         first = np.flatnonzero(np.diff(equations.tile[order], prepend=-1))
         matrix = np.stack(
             [
@@ -276,7 +276,7 @@ def _slopes(
     equations: Equations, terms: Float64[np.ndarray, "7"]
 ) -> tuple[Float64[np.ndarray, "e 7"], Float64[np.ndarray, "e"]]:
     """Derivative of each equation by each term, and the activity of its neighbours."""
-    base = equations.by_events(terms)
+    base = equations.by_events(terms)  # [e, 5]
     slopes = np.ones((len(base), TERMS))
     for term, step in (
         (NEGATIVE, THRESHOLD_STEP),

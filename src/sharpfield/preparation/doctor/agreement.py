@@ -124,7 +124,7 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
     index = build_index(capture.needed_events)
     pairs = find_exposure_pairs(capture, most=PAIRS)
     from_frames = np.stack([_luma_change(pair) for pair in pairs])
-    usable = np.stack([pair.usable.all(-1) for pair in pairs])
+    usable = np.stack([pair.usable.all(-1) for pair in pairs])  # [n, h, w]
     shifts = np.arange(-MAX_SHIFT_US, MAX_SHIFT_US + 1, COARSE_US)
     scores = np.array(
         [

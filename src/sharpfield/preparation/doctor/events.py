@@ -41,7 +41,7 @@ def _median_around(count: Int64[np.ndarray, "h w"]) -> Float64[np.ndarray, "h w"
     padded = nn.functional.pad(
         torch.from_numpy(count).double()[None, None], (reach,) * 4, mode="replicate"
     )
-    windows = padded.unfold(2, AROUND, 1).unfold(3, AROUND, 1)
+    windows = padded.unfold(2, AROUND, 1).unfold(3, AROUND, 1)  # [1, 1, h, w, 7, 7]
     return windows.flatten(-2).median(-1).values[0, 0].numpy()
 
 

@@ -173,11 +173,11 @@ def image_speed(capture: Capture, edges_us: Int64[np.ndarray, "k"]) -> Float64[n
     depth = 2 / (1 / capture.near + 1 / capture.far)
     share = (np.arange(4) + 0.5) / 4
     grid = np.stack(np.meshgrid(share * camera.width, share * camera.height), -1).reshape(-1, 2)
-    ray = camera.direction(torch.from_numpy(grid)).numpy()
-    local = ray / ray[:, 2:] * depth
-    world = local @ poses[:-1, :, :3].swapaxes(1, 2) + poses[:-1, None, :, 3]
+    ray = camera.direction(torch.from_numpy(grid)).numpy()  # [16, 3]
+    local = ray / ray[:, 2:] * depth  # on the plane of the mean disparity
+    world = local @ poses[:-1, :, :3].swapaxes(1, 2) + poses[:-1, None, :, 3]  # [n, 16, 3]
     then = (world - poses[1:, None, :, 3]) @ poses[1:, :, :3]
-    moved = camera.project(torch.from_numpy(then)).numpy() - grid
+    moved = camera.project(torch.from_numpy(then)).numpy() - grid  # [n, 16, 2]
     return np.linalg.norm(moved, axis=-1).mean(-1)
 
 

@@ -83,7 +83,7 @@ def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]
     shape = len(found.poses), len(found.points)
     seen = np.zeros(shape, np.float32)
     seen[view[good], point[good]] = 1
-    shared = np.triu(seen @ seen.T, 1) >= SHARED
+    shared = np.triu(seen @ seen.T, 1) >= SHARED  # [n, n], each pair once
     one, two = np.nonzero(shared)
     if not len(one):
         return []
