@@ -18,6 +18,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Note, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import Exposure, Frames
+from sharpfield.geometry.normalise import focus
 from sharpfield.geometry.trajectory import Still
 from sharpfield.storage.images import list_images
 
@@ -29,6 +30,10 @@ HOLD_OUT = "every:8"
 
 PHOTOS = Known(motion="unknown")
 """Knowledge about photos with one pose each: they may be sharp or blurred."""
+
+
+NEAR, FAR = 0.1, 10.0
+"""Estimated depth bounds, relative to the distance of the cameras from their common focus."""
 
 
 @dataclass(frozen=True)
@@ -214,6 +219,21 @@ def depth_bounds(
             do="give the option `bounds`: near and far",
         )
     return float(np.min(limits)), float(np.max(limits))
+
+
+def estimated_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
+    """Depth bounds estimated from the point nearest to all optical axes.
+
+    Where the axes are parallel there is none; then it is put at ten times the spread of the
+    cameras.
+    """
+    centre, forward = poses[:, :, 3], poses[:, :, 2]
+    target = focus(poses)
+    if target is not None:
+        depth = float(np.median(((target - centre) * forward).sum(-1)))
+    else:
+        depth = 10 * (float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0)
+    return NEAR * depth, FAR * depth
 
 
 def _agree(a: Camera, b: Camera) -> bool:

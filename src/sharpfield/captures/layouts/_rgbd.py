@@ -18,7 +18,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.frames import MILLIMETRE, DepthMaps
-from sharpfield.storage.images import image_stack
+from sharpfield.storage.images import image_stack, read_image
 
 BOUNDS = (0.1, 8.0)
 """Nearest and farthest depth of rooms, in metres."""
@@ -33,6 +33,9 @@ FARTHEST_POSE = 30.0
 """Poses with a larger entry (metres) are tracking failures."""
 LISTED = 6
 """Number of dropped frames that are listed by name."""
+
+PUBLISHED_SPLIT = "train:5"
+"""One frame in five is for training, see `captures.hold_out`."""
 
 Row = int
 """Index of a frame in its recording."""
@@ -196,6 +199,23 @@ def read_pose(path: Path) -> Float64[np.ndarray, "3 4"]:
             "a pose must have 4 columns and 3 or 4 rows", where=path, got=matrix.shape
         )
     return matrix[:3].astype(np.float64)
+
+
+def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """Read an 8-bit image as RGB.
+
+    Raises:
+        CaptureError: The image does not have 8 bits.
+    """
+    image = read_image(path)
+    if image.dtype != np.uint8:
+        raise CaptureError(
+            "a colour image must have 8 bits",
+            where=path,
+            got=image.dtype,
+            do="convert it to 8 bits",
+        )
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.shape[-1] == 1 else image
 
 
 def _sized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "y x 3"]:

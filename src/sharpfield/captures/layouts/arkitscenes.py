@@ -25,8 +25,13 @@ from jaxtyping import Bool, Float64, Shaped
 
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts._rgbd import RgbdFrames, read_matrix, rgbd_capture
-from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT, rgb
+from sharpfield.captures.layouts._rgbd import (
+    PUBLISHED_SPLIT,
+    RgbdFrames,
+    read_matrix,
+    read_rgb,
+    rgbd_capture,
+)
 from sharpfield.captures.native.frames import decode_depth
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock
@@ -72,7 +77,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     frames = RgbdFrames(
         names=[path.stem for path in colour],
         poses=_poses(folder / TRAJECTORY, [_seconds(path) for path in colour]),
-        colour=lambda row: rgb(colour[row]),
+        colour=lambda row: read_rgb(colour[row]),
         depth=lambda row: decode_depth(maps[row]),
         measured=measured,
         camera=camera,

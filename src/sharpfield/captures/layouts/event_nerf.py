@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts.nerfstudio import estimated_bounds
+from sharpfield.captures.layouts._photos import estimated_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.errors import CaptureError

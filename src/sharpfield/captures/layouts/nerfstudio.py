@@ -22,6 +22,7 @@ from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
     PHOTOS,
     Photos,
+    estimated_bounds,
     existing,
     photo_capture,
     same_camera,
@@ -38,12 +39,8 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.lenses import LENSES, PINHOLE
-from sharpfield.geometry.normalise import focus
 from sharpfield.storage.images import read_images
 from sharpfield.storage.ply import columns, read_ply
-
-NEAR, FAR = 0.1, 10.0
-"""Estimated depth bounds, relative to the distance of the cameras from their common focus."""
 
 
 def recognise(folder: Path) -> bool:
@@ -86,21 +83,6 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         points=_points(folder, content, path),
         known=known,
     )
-
-
-def estimated_bounds(poses: Float64[np.ndarray, "n 3 4"]) -> tuple[float, float]:
-    """Depth bounds estimated from the point nearest to all optical axes.
-
-    Where the axes are parallel there is none; then it is put at ten times the spread of the
-    cameras.
-    """
-    centre, forward = poses[:, :, 3], poses[:, :, 2]
-    target = focus(poses)
-    if target is not None:
-        depth = float(np.median(((target - centre) * forward).sum(-1)))
-    else:
-        depth = 10 * (float(np.linalg.norm(centre - centre.mean(0), axis=-1).max()) or 1.0)
-    return NEAR * depth, FAR * depth
 
 
 def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.ndarray, "m 3"] | None:

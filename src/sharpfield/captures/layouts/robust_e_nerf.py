@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float64, Shaped
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
+from sharpfield.captures.layouts._photos import estimated_bounds
 from sharpfield.captures.layouts._transforms import (
     frame_name,
     frames_of,
@@ -29,7 +30,6 @@ from sharpfield.captures.layouts._transforms import (
     poses_of,
     read_json,
 )
-from sharpfield.captures.layouts.nerfstudio import estimated_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError

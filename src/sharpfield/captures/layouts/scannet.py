@@ -17,29 +17,27 @@ Source: Dai et al., *ScanNet* (CVPR 2017).
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
+    PUBLISHED_SPLIT,
     RgbdFrames,
     pinhole,
     read_matrix,
     read_pose,
+    read_rgb,
     rgbd_capture,
     usable_poses,
 )
 from sharpfield.captures.native.frames import decode_depth
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import SUFFIXES, image_stack, read_image
 from sharpfield.storage.ply import columns, read_ply
 
-PUBLISHED_SPLIT = "train:5"
-"""One frame in five is for training, see `captures.hold_out`."""
 COLOUR, DEPTH, POSE, TRUTH = ("color", "rgb"), "depth", "pose", "truth"
 BLUR = "blur_px.txt"
 INTRINSIC_COLOUR = Path("intrinsic") / "intrinsic_color.txt"
@@ -74,7 +72,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     frames = RgbdFrames(
         names=names,
         poses=np.stack([_pose(inner / POSE / f"{name}.txt") for name in names]),
-        colour=lambda row: rgb(colour[row]),
+        colour=lambda row: read_rgb(colour[row]),
         depth=lambda row: decode_depth(maps[row]),
         measured=measured,
         camera=camera,
@@ -90,23 +88,6 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         points=_mesh(folder),
     )
     return _with_truth(made, inner, np.flatnonzero(usable_poses(frames.poses)))
-
-
-def rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an 8-bit image as RGB.
-
-    Raises:
-        CaptureError: The image does not have 8 bits.
-    """
-    image = read_image(path)
-    if image.dtype != np.uint8:
-        raise CaptureError(
-            "a colour image must have 8 bits",
-            where=path,
-            got=image.dtype,
-            do="convert it to 8 bits",
-        )
-    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.shape[-1] == 1 else image
 
 
 def by_number(folder: Path) -> list[Path]:
@@ -157,7 +138,7 @@ def _with_truth(capture: Capture, inner: Path, kept: Int64[np.ndarray, "n"]) -> 
         unknown = np.zeros(frames.images.shape[1:], np.uint8)
         truth = image_stack(
             paths,
-            lambda path: rgb(path) if path.is_file() else unknown,
+            lambda path: read_rgb(path) if path.is_file() else unknown,
             sources=[path for path in paths if path.is_file()],
             kind="truth",
         )

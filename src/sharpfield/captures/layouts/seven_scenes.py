@@ -18,8 +18,14 @@ from jaxtyping import UInt16
 
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts._rgbd import RgbdFrames, read_pose, rgbd_capture, usable_poses
-from sharpfield.captures.layouts.scannet import PUBLISHED_SPLIT, rgb
+from sharpfield.captures.layouts._rgbd import (
+    PUBLISHED_SPLIT,
+    RgbdFrames,
+    read_pose,
+    read_rgb,
+    rgbd_capture,
+    usable_poses,
+)
 from sharpfield.captures.native.frames import decode_depth
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
@@ -51,7 +57,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     colour = sorted(folder.glob(COLOUR)) or sorted(folder.glob(f"seq-*/{COLOUR}"))
     if not colour:
         raise CaptureError("there are no frames", where=folder, do=f"it must hold {COLOUR}")
-    height, width, _ = rgb(colour[0]).shape
+    height, width, _ = read_rgb(colour[0]).shape
     focal = FOCAL_OF_WIDTH * width
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
     poses = np.stack([read_pose(_beside(path, "pose.txt")) for path in colour])
@@ -61,7 +67,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     frames = RgbdFrames(
         names=[_name(path, several) for path in colour],
         poses=poses,
-        colour=lambda row: rgb(colour[row]),
+        colour=lambda row: read_rgb(colour[row]),
         depth=lambda row: _depth(maps[row]),
         measured=np.array([path.is_file() for path in maps]),
         camera=camera,
