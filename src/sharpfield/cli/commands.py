@@ -46,7 +46,11 @@ GROUPS: dict[str, dict[str, Command]] = {
         ),
     },
     "prepare": {
-        "ingest": Command("ingest:ingest_command", "make a capture of what a camera has recorded"),
+        "ingest": Command(
+            "ingest:ingest_command",
+            "make a capture of what a camera has recorded",
+            renamed={"per_second": "fps", "lonely_ms": "isolated_ms"},
+        ),
         "inspect": Command(
             "inspect:inspect_command", "say what a capture, or a file of events, holds"
         ),

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -21,20 +21,21 @@ from tyro.conf import Positional
 from sharpfield.cli.arguments import End, Start, parse_size, screen
 from sharpfield.core.errors import OptionError
 from sharpfield.core.progress import progress_on
-from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.preparation.ingest.options import (
     AxisFixes,
     Cleaning,
     Crop,
     IngestOptions,
+    Optics,
     Scene,
     Timing,
     fixed_axes,
 )
-from sharpfield.preparation.ingest.pipeline import IngestSummary, StepProgress
-from sharpfield.preparation.ingest.pipeline import ingest as ingest_recordings
 from sharpfield.recordings.open import format_named, format_of, open_recording
 from sharpfield.recordings.recording import Format, ReaderOptions, Recording
+
+if TYPE_CHECKING:
+    from sharpfield.preparation.ingest.pipeline import IngestSummary, StepProgress
 
 FRAMES_ONLY = ("video", "images")
 """Formats that hold no events."""
@@ -138,14 +139,16 @@ def ingest_command(
     opened = tuple(source.opened(path) for path in recordings)
     for recording in opened:
         console.print(f"{recording.path} is {recording.layout}")
+    from sharpfield.preparation.ingest.pipeline import ingest
+
     options = IngestOptions(optics, cleaning, Crop(part.start_ms, part.end_ms), timing, scene)
     with _progress(console) as progress:
-        ingested = ingest_recordings(opened, out, options, progress)
+        ingested = ingest(opened, out, options, progress)
     for line in _summary_lines(ingested, out):
         console.print(line, soft_wrap=True)
 
 
-def _summary_lines(ingested: IngestSummary, out: Path) -> Iterator[str]:
+def _summary_lines(ingested: "IngestSummary", out: Path) -> Iterator[str]:
     seconds = (ingested.span_us[1] - ingested.span_us[0]) / 1e6
     counts = f"{ingested.frames:,} frames and {ingested.events:,} events"
     yield f"{counts} over {seconds:.3f} s are in {out}"
@@ -162,7 +165,7 @@ def _summary_lines(ingested: IngestSummary, out: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _progress(console: Console) -> Iterator[StepProgress]:
+def _progress(console: Console) -> Iterator["StepProgress"]:
     """A progress bar for each step."""
     columns = (
         TextColumn("{task.description}"),

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int8, Int64, Shaped
 
-from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
 
@@ -105,8 +104,8 @@ class Recording:
     """Reads the trigger edges; None if there are none."""
     bayer: str = ""
     """Colour filter array of the raw sensor, e.g. "RGGB"; "" if monochrome or unknown."""
-    thresholds: Thresholds | None = None
-    """Contrast thresholds, where the file gives them."""
+    thresholds: tuple[float, float] | None = None
+    """Contrast thresholds in natural log, negative and positive, where the file gives them."""
     frame_encoding: str = ""
     """How pixel values relate to light (see `core.frames.ENCODINGS`); "" if unknown."""
     log: ReadLog = field(default_factory=ReadLog)

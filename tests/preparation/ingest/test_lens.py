@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.preparation.ingest.lens import Optics, capture_geometry
+from sharpfield.preparation.ingest.lens import capture_geometry
+from sharpfield.preparation.ingest.options import Optics
 from tests.streams import HEIGHT, WIDTH, random_events
 
 SIZE = (WIDTH, HEIGHT)

@@ -14,8 +14,14 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.geometry.trajectory import Stamped
-from sharpfield.preparation.ingest.lens import Optics
-from sharpfield.preparation.ingest.options import Cleaning, Crop, IngestOptions, Scene, Timing
+from sharpfield.preparation.ingest.options import (
+    Cleaning,
+    Crop,
+    IngestOptions,
+    Optics,
+    Scene,
+    Timing,
+)
 from sharpfield.preparation.ingest.pipeline import IngestSummary, ingest
 from sharpfield.preparation.ingest.stage import StagingFolder
 from sharpfield.recordings.open import open_recording

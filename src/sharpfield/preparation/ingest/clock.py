@@ -8,7 +8,7 @@ its significance.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -16,6 +16,7 @@ from numba import njit
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.frames import Exposure
+from sharpfield.preparation.ingest.options import Stamp
 from sharpfield.recordings.recording import Triggers
 
 MIN_PAIRS = 8
@@ -30,9 +31,6 @@ MAX_PAIRS = 3000
 """Frame pairs used; of longer recordings, those in the middle."""
 STEPS = 4
 """Offsets tried per frame interval in the coarse search."""
-
-Stamp = Literal["open", "middle", "close"]
-"""Meaning of the single time of a frame."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ this is valid for objects that are far away compared with the distance of the tw
 """
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Certainty
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, SiteColour
+from sharpfield.preparation.ingest.options import Optics
 from sharpfield.recordings.lens_files import (
     Calibration,
     read_calibration,
@@ -36,23 +36,6 @@ DEMOSAIC = {
     "BGGR": cv2.COLOR_BayerBGGR2RGB,
 }
 """OpenCV's demosaicing code by colour filter array."""
-
-
-@dataclass(frozen=True)
-class Optics:
-    """Lens calibration."""
-
-    calibration: Path | None = None
-    """Calibration file of Kalibr, OpenCV, ROS, DSEC, or RPG's calib.txt. Without one, the focal
-    length is a placeholder until it is estimated with the poses."""
-    camera: str | None = None
-    """Name of the event camera in the calibration, where it has several: cam0."""
-    frame_camera: str | None = None
-    """Name of the frame camera in the calibration, where it is another one: cam1."""
-    rectify: bool = False
-    """Undistort: frames by resampling, events by giving them positions between pixels."""
-    resize: bool = False
-    """Scale frames to the resolution of the event sensor, where both share one lens."""
 
 
 @dataclass(frozen=True)

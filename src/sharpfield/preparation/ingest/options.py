@@ -11,9 +11,27 @@ import numpy as np
 
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
-from sharpfield.preparation.ingest.clock import Stamp
-from sharpfield.preparation.ingest.lens import Optics
 from sharpfield.recordings.recording import Chunks, Recording
+
+Stamp = Literal["open", "middle", "close"]
+"""Meaning of the single time of a frame."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Lens calibration."""
+
+    calibration: Path | None = None
+    """Calibration file of Kalibr, OpenCV, ROS, DSEC, or RPG's calib.txt. Without one, the focal
+    length is a placeholder until it is estimated with the poses."""
+    camera: str | None = None
+    """Name of the event camera in the calibration, where it has several: cam0."""
+    frame_camera: str | None = None
+    """Name of the frame camera in the calibration, where it is another one: cam1."""
+    rectify: bool = False
+    """Undistort: frames by resampling, events by giving them positions between pixels."""
+    resize: bool = False
+    """Scale frames to the resolution of the event sensor, where both share one lens."""
 
 
 @dataclass(frozen=True)

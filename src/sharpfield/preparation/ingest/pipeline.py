@@ -14,7 +14,15 @@ import numpy as np
 
 from sharpfield.captures.native import layout as native
 from sharpfield.captures.paths.pose_file import read_poses
-from sharpfield.core.capture import POSE_TOLERANCE_US, Capture, Clock, Known, Note, Split
+from sharpfield.core.capture import (
+    POSE_TOLERANCE_US,
+    Capture,
+    Clock,
+    Known,
+    Note,
+    Split,
+    Thresholds,
+)
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.files import write_json
@@ -379,11 +387,12 @@ class _Ingest:
 
     def _known(self, geometry: CaptureGeometry) -> Known:
         scene = self._options.scene
+        thresholds = None if self._events is None else self._events.thresholds
         return Known(
             poses="unknown" if scene.poses is None else "known",
             intrinsics=geometry.intrinsics,
             bounds="unknown" if None in (scene.near, scene.far) else "known",
-            thresholds=None if self._events is None else self._events.thresholds,
+            thresholds=Thresholds(*thresholds) if thresholds else None,
         )
 
     def _finish(self, capture: Capture, frames: WrittenFrames | None) -> None:

@@ -24,7 +24,6 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Int64, Shaped
 
-from sharpfield.core.capture import Thresholds
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.chunks import expect_inside
 from sharpfield.recordings.recording import (
@@ -57,7 +56,7 @@ def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
         _expect_unit(file)
         _expect_size(file)
         integral = _integral(file)
-        size, bayer, stated = file.size, file.bayer, file.thresholds
+        size, bayer, thresholds = file.size, file.bayer, file.thresholds
 
     def events() -> Chunks:
         with open_file() as opened:
@@ -69,7 +68,7 @@ def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
         size=size,
         events=events,
         bayer=bayer,
-        thresholds=None if stated is None else Thresholds(*stated),
+        thresholds=thresholds,
         log=log,
     )
 
