@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.console import Console
@@ -26,16 +26,15 @@ from sharpfield.preparation.ingest.options import (
     Cleaning,
     Crop,
     IngestOptions,
+    IngestSummary,
     Optics,
     Scene,
+    StepProgress,
     Timing,
     fixed_axes,
 )
 from sharpfield.recordings.open import format_named, format_of, open_recording
 from sharpfield.recordings.recording import Format, ReaderOptions, Recording
-
-if TYPE_CHECKING:
-    from sharpfield.preparation.ingest.pipeline import IngestSummary, StepProgress
 
 FRAMES_ONLY = ("video", "images")
 """Formats that hold no events."""
@@ -148,7 +147,7 @@ def ingest_command(
         console.print(line, soft_wrap=True)
 
 
-def _summary_lines(ingested: "IngestSummary", out: Path) -> Iterator[str]:
+def _summary_lines(ingested: IngestSummary, out: Path) -> Iterator[str]:
     seconds = (ingested.span_us[1] - ingested.span_us[0]) / 1e6
     counts = f"{ingested.frames:,} frames and {ingested.events:,} events"
     yield f"{counts} over {seconds:.3f} s are in {out}"
@@ -165,7 +164,7 @@ def _summary_lines(ingested: "IngestSummary", out: Path) -> Iterator[str]:
 
 
 @contextmanager
-def _progress(console: Console) -> Iterator["StepProgress"]:
+def _progress(console: Console) -> Iterator[StepProgress]:
     """A progress bar for each step."""
     columns = (
         TextColumn("{task.description}"),

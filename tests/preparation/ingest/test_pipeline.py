@@ -18,11 +18,12 @@ from sharpfield.preparation.ingest.options import (
     Cleaning,
     Crop,
     IngestOptions,
+    IngestSummary,
     Optics,
     Scene,
     Timing,
 )
-from sharpfield.preparation.ingest.pipeline import IngestSummary, ingest
+from sharpfield.preparation.ingest.pipeline import ingest
 from sharpfield.preparation.ingest.stage import StagingFolder
 from sharpfield.recordings.open import open_recording
 from sharpfield.recordings.recording import Frame, ReaderOptions, Recording, Triggers

@@ -24,6 +24,7 @@ from sharpfield.recordings.lens_files import (
     resampling_map,
     undistorted_pixels,
 )
+from sharpfield.recordings.recording import Recording
 
 Size = tuple[int, int]
 """Width and height in pixels."""
@@ -133,6 +134,17 @@ def capture_geometry(
         resampling_map(ideal, camera) if ideal != camera else None,
         pixel_positions=pixel_positions,
     )
+
+
+def colour_filter(recording: Recording, given: str | None) -> str:
+    """Colour filter array of a recording, unless it is given; "" for none.
+
+    Raises:
+        OptionError: It is no known one.
+    """
+    if given not in (None, "none", *DEMOSAIC):
+        raise OptionError("unknown colour filter", got=given, do=f"use none, {', '.join(DEMOSAIC)}")
+    return recording.bayer if given is None else given.replace("none", "")
 
 
 def empty_stream(size: Size) -> EventStream:

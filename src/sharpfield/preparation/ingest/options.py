@@ -1,8 +1,9 @@
-"""Options of `ingest`, and correction of wrong event axes and polarities.
+"""Options and summary of `ingest`, and correction of wrong event axes and polarities.
 
 `sharpfield doctor` detects such errors by comparing events with frames.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -99,6 +100,28 @@ class IngestOptions:
     crop: Crop = field(default_factory=Crop)
     timing: Timing = field(default_factory=Timing)
     scene: Scene = field(default_factory=Scene)
+
+
+StepProgress = Callable[[str, int, int | None], None]
+"""Called with the name of a step, how much of it is done, and the total where it is known."""
+
+
+@dataclass(frozen=True)
+class IngestSummary:
+    """Result of an ingestion."""
+
+    events: int
+    """Number of events in the capture."""
+    frames: int
+    span_us: tuple[int, int]
+    """First and last time of the capture."""
+    left_out: dict[str, int]
+    """What was left out, by reason."""
+    hot_pixels: int
+    clock: str
+    """How frame times were converted to the clock of the events; "" if they were not."""
+    unknown: tuple[str, ...]
+    """What is unknown yet: poses, intrinsics, depth bounds."""
 
 
 def assign_roles(

@@ -6,8 +6,8 @@ poses above all, is a placeholder, and `Capture.known` says so: see `captures.na
 """
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,12 +37,17 @@ from sharpfield.preparation.ingest.clock import (
     with_exposure,
 )
 from sharpfield.preparation.ingest.lens import (
-    DEMOSAIC,
     CaptureGeometry,
     capture_geometry,
+    colour_filter,
     empty_stream,
 )
-from sharpfield.preparation.ingest.options import IngestOptions, assign_roles
+from sharpfield.preparation.ingest.options import (
+    IngestOptions,
+    IngestSummary,
+    StepProgress,
+    assign_roles,
+)
 from sharpfield.preparation.ingest.stage import (
     StagingFolder,
     WrittenFrames,
@@ -58,27 +63,6 @@ from sharpfield.recordings.recording import Recording
 
 NEAR, FAR = 1.0, 100.0
 """Placeholders for unknown depth bounds."""
-
-StepProgress = Callable[[str, int, int | None], None]
-"""Called with the name of a step, how much of it is done, and the total where it is known."""
-
-
-@dataclass(frozen=True)
-class IngestSummary:
-    """Result of an ingestion."""
-
-    events: int
-    """Number of events in the capture."""
-    frames: int
-    span_us: tuple[int, int]
-    """First and last time of the capture."""
-    left_out: dict[str, int]
-    """What was left out, by reason."""
-    hot_pixels: int
-    clock: str
-    """How frame times were converted to the clock of the events; "" if they were not."""
-    unknown: tuple[str, ...]
-    """What is unknown yet: poses, intrinsics, depth bounds."""
 
 
 def ingest(
@@ -184,20 +168,12 @@ class _Ingest:
             self._frames.frames(),
             self._stage.capture / "frames",
             geometry,
-            self._bayer(self._frames),
+            colour_filter(self._frames, self._options.scene.bayer),
             lambda count: self._progress("writing frames", count, None),
         )
         save_frames(written, self._stage.frames_record)
         self._log_dropped(self._frames)
         return written
-
-    def _bayer(self, recording: Recording) -> str:
-        given = self._options.scene.bayer
-        if given not in (None, "none", *DEMOSAIC):
-            raise OptionError(
-                "unknown colour filter", got=given, do=f"use none, {', '.join(DEMOSAIC)}"
-            )
-        return recording.bayer if given is None else given.replace("none", "")
 
     def _exposure(self, frames: WrittenFrames, survey: Survey | None) -> tuple[Exposure, str]:
         """Exposures on the clock of the events, and how they were determined."""
@@ -266,7 +242,7 @@ class _Ingest:
         else:
             # The colour filter of a separate frame camera is not that of the event sensor.
             unknown = geometry.separate_sensors and self._options.scene.bayer is None
-            bayer = "" if unknown else self._bayer(self._events)
+            bayer = "" if unknown else colour_filter(self._events, self._options.scene.bayer)
             chunks = (event_filter.filtered(chunk) for chunk in self._event_chunks(survey.count))
             self._stage.write(
                 (geometry.mapped_events(chunk, bayer) for chunk in chunks),
@@ -338,7 +314,7 @@ class _Ingest:
         scene = self._options.scene
         frames = None
         if written is not None and exposure is not None and self._frames is not None:
-            raw = "linear" if self._bayer(self._frames) else "gamma2.2"
+            raw = "linear" if colour_filter(self._frames, self._options.scene.bayer) else "gamma2.2"
             blank = np.zeros((), f"uint{written.bits}")
             frames = Frames(
                 # Placeholder pixels: the images are on disk already.
