@@ -34,11 +34,11 @@ def test_flags_may_stand_before_the_capture(recorded: Path, tmp_path: Path) -> N
 def test_change_still_works_and_names_the_flags(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("--change", "volume.octaves=3,2", "decay=7")
+    words = ("--change", "volume.octaves=3,2", "lr_decay_steps=7")
     options = trained(recorded, tmp_path / "run", *words)
     assert options["volume"]["octaves"] == [3, 2] and options["lr_decay_steps"] == 7
     said = capsys.readouterr().err.splitlines()
-    assert said == ["note: --change will go; write --volume.octaves 3 2 --decay 7"]
+    assert said == ["note: --change will go; write --volume.octaves 3 2 --lr-decay-steps 7"]
 
 
 def test_old_names_of_options_are_accepted_with_a_hint(

@@ -143,14 +143,19 @@ def _run(words: list[str]) -> None:
 
 def _call(name: str, words: list[str]) -> None:
     """Run a command with the options that are given in words."""
+    prog = f"sharpfield {name}"
     words = recipe_options.renamed(COMMANDS[name].renamed, words)
     config: tuple[Any, ...] = (tyro.conf.FlagCreatePairsOff,)
     if COMMANDS[name].recipe:
         recipe_options.expect_recipe(words)  # before anything heavy is imported
+        if not {"-h", "--help"} & set(words) and not any(w.startswith("-") for w in words[:2]):
+            # Mistakes that are none of the recipe's are said before it is imported.
+            bare = recipe_options.without_recipe_flags(load(name))
+            tyro.cli(bare, prog=prog, args=words, config=config, return_unknown_args=True)
         function, words = recipe_options.with_recipe_flags(load(name), words)
     else:
         function, config = load(name), (*config, tyro.conf.OmitArgPrefixes)
-    tyro.cli(function, prog=f"sharpfield {name}", args=words, config=config)
+    tyro.cli(function, prog=prog, args=words, config=config)
 
 
 def load(name: str) -> Callable[..., None]:

@@ -41,6 +41,15 @@ def recipe_in(words: Sequence[str]) -> str | None:
     return next((b for a, b in pairs if b in RECIPES and not a.startswith("--")), None)
 
 
+def without_recipe_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Takes what a command takes, but for the options of a recipe, and does nothing with it."""
+
+    def ignore(*_: Any, **__: Any) -> None:
+        pass
+
+    return _with_parameters(command, _own_parameters(command), lambda options: options, ignore)
+
+
 def with_recipe_flags(
     command: Callable[..., None], words: Sequence[str]
 ) -> tuple[Callable[..., None], list[str]]:
@@ -50,8 +59,7 @@ def with_recipe_flags(
         command: Its parameter `numbers` gets the options that were given.
         words: On the command line; old names of options are replaced, with a hint.
     """
-    signature = inspect.signature(command)
-    others = [one for one in signature.parameters.values() if one.name != "numbers"]
+    others = _own_parameters(command)
     name = recipe_in(words)
     if name is None:
         return _with_parameters(command, others, lambda options: options), list(words)
@@ -86,8 +94,8 @@ def hint_at_flags(recipe: str, changes: Sequence[str]) -> None:
     """
     if changes:
         changed(recipe_named(recipe)(), changes)
-        flags = (change.replace("=", " ", 1).replace(",", " ") for change in changes)
-        said = " ".join(f"--{flag}" for flag in flags)
+        pairs = (change.split("=", 1) for change in changes)
+        said = " ".join(f"--{a.replace('_', '-')} {b.replace(',', ' ')}" for a, b in pairs)
         warnings.warn(f"--change will go; write {said}", Hint, stacklevel=2)
 
 
@@ -130,14 +138,28 @@ def _flags_of(parameters: list[inspect.Parameter]) -> set[str]:
     return fields | {one.name for one in parameters}
 
 
+def _own_parameters(command: Callable[..., None]) -> list[inspect.Parameter]:
+    return [one for one in inspect.signature(command).parameters.values() if one.name != "numbers"]
+
+
 def _with_parameters(
     command: Callable[..., None],
     parameters: list[inspect.Parameter],
     change: Callable[[dict[str, Any]], dict[str, Any]],
+    run: Callable[..., None] | None = None,
 ) -> Callable[..., None]:
+    """A command with other parameters.
+
+    Args:
+        command: Has the documentation.
+        parameters: Those to have.
+        change: From the options that are given to those that the command takes.
+        run: Called instead of the command, if given.
+    """
+
     @functools.wraps(command)
     def call(*positional: Any, **options: Any) -> None:
-        command(*positional, **change(options))
+        (run or command)(*positional, **change(options))
 
     del call.__wrapped__
     signature = inspect.signature(command)

@@ -49,6 +49,10 @@ class Registry(Mapping[str, T]):
             raise KeyError(name)
         return found
 
+    def __contains__(self, name: object) -> bool:
+        """Whether there is an object of this name; it is not loaded."""
+        return name in self.own or name in _installed(self.group)
+
     def __iter__(self) -> Iterator[str]:
         """Names of our own objects, then of those of other packages, none of which is loaded."""
         yield from self.own
