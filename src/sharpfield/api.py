@@ -21,7 +21,7 @@ from sharpfield.recipes.settings.options import with_options
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.recordings.open import open_recording as open_any
 from sharpfield.recordings.recording import ReaderOptions, Recording
-from sharpfield.runs.captures import LayoutName, write
+from sharpfield.runs.captures import LayoutName, expect_capture, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
 from sharpfield.runs.start import train_run
@@ -75,6 +75,7 @@ def read(
         CaptureError: The capture cannot be read, or its poses are not known yet.
         OptionError: An option does not fit the layout.
     """
+    _expect_path(path)
     options = ReadOptions(
         layout=layout,
         event_unit=event_unit,
@@ -128,6 +129,7 @@ def open_recording(
         CaptureError: The file is missing, of no known format, damaged, or leaves something open.
         OptionError: An option does not belong to the format.
     """
+    _expect_path(path)
     options = ReaderOptions(
         unit,
         size,
@@ -252,6 +254,7 @@ def deblur(
         CaptureError: Frames or events are missing, or no frame is blurred.
         OptionError: The method does not give several images.
     """
+    expect_capture(capture)
     options = DeblurOptions(threshold, method, instants)
     return (
         deblur_capture(capture, options) if out is None else deblur_to(capture, Path(out), options)
@@ -304,12 +307,8 @@ def train(
         CaptureError: The capture cannot be read, or lacks what the recipe needs.
         RunError: `out` already holds a run, or a loss is not finite.
     """
-    if not isinstance(capture, Capture | Path | str):
-        raise OptionError(
-            "this is not a capture",
-            got=type(capture).__name__,
-            do="give the folder of one, or what sf.read or sf.simulate return",
-        )
+    if not isinstance(capture, Path | str):
+        expect_capture(capture)
     recipe_named(recipe)  # before anything is read
     where = device_named(device)
     length = TrainingOptions(steps=steps, minutes=minutes, resume=resume, memory_gb=memory_gb)
@@ -325,3 +324,8 @@ def train(
         block=block,
     )
     return train_run(config, source, Path(out), length, device=where)
+
+
+def _expect_path(path: object) -> None:
+    if not isinstance(path, Path | str):
+        raise OptionError("this is not a path", got=type(path).__name__, do="give a Path or a text")

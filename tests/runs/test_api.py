@@ -165,7 +165,9 @@ def changed(run: sf.Run, options: dict) -> sf.Run:
 
 WRONG_TYPES = """
 import numpy as np, sharpfield as sf
+from dataclasses import replace
 run = sf.open_run(%r, device="cpu")
+capture, frames, events = run.capture, run.capture.frames, run.capture.events
 for wrong in (
     lambda: run.render("first"),
     lambda: run.render(np.eye(3)),
@@ -174,6 +176,18 @@ for wrong in (
     lambda: sf.train("ev-splat", run.capture, out="x", device="gpu"),
     lambda: sf.simulate(size=5),
     lambda: sf.simulate(size=("8", 8)),
+    lambda: sf.read(3),
+    lambda: sf.write("capture", "x"),
+    lambda: sf.deblur("capture"),
+    lambda: replace(frames, images=frames.images[..., 0]),
+    lambda: replace(frames, images=frames.images / 255),
+    lambda: replace(frames, truth=frames.truth[:, 1:]),
+    lambda: sf.Exposure([0, 1], [2, 3]),
+    lambda: sf.Exposure(np.array([0, 1]), np.array([2])),
+    lambda: sf.deblur(replace(capture, events=replace(events, p=events.p.astype(float)))),
+    lambda: sf.deblur(replace(capture, events=replace(events, x=events.x[1:]))),
+    lambda: sf.deblur(replace(capture, events=replace(events, p=np.maximum(events.p, 0)))),
+    lambda: sf.geometry.Still(np.eye(4)),
 ):
     try:
         wrong()
@@ -191,6 +205,7 @@ def test_wrong_types_are_said_in_words(run: sf.Run) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr
+    count = len(run.capture.needed_events)
     assert done.stdout.splitlines() == [
         "this says no viewpoint | str",
         "a pose has another shape | (3, 3)",
@@ -199,6 +214,18 @@ def test_wrong_types_are_said_in_words(run: sf.Run) -> None:
         "unknown device | gpu",
         "this is not the size of a sensor | 5",
         "this is not the size of a sensor | ('8', 8)",
+        "this is not a path | int",
+        "this is not a capture | str",
+        "this is not a capture | str",
+        "`images` of Frames has another shape or type | ndarray uint8 of shape (6, 16, 24)",
+        "`images` of Frames has another shape or type | ndarray float64 of shape (6, 16, 24, 3)",
+        "`truth` of Frames has another shape or type | ndarray uint8 of shape (6, 15, 24, 3)",
+        "`open_us` of Exposure has another shape or type | list",
+        "`close_us` of Exposure has another shape or type | ndarray int64 of shape (1,)",
+        f"`p` of EventStream has another shape or type | ndarray float64 of shape ({count},)",
+        f"event columns have different lengths | x {count - 1}, y {count}, t {count}, p {count}",
+        "polarity must be -1 or +1 | 0",
+        "poses have another shape | (4, 4)",
     ]
 
 

@@ -5,12 +5,16 @@ these; the command line prints the message alone and exits with code 2. Truths i
 program are plain assertions.
 
 Optional packages: imported where they are used, with an error that names the extra.
+
+Arrays of users: checked against the annotations of what they are given to.
 """
 
+import dataclasses
 import importlib
 from collections.abc import Iterable
 from difflib import get_close_matches
 from types import ModuleType
+from typing import Any, cast
 
 
 class SharpfieldError(Exception):
@@ -88,3 +92,44 @@ def need(package: str, *, extra: str, purpose: str) -> ModuleType:
         if missing.name != package.partition(".")[0]:
             raise
         raise MissingExtra(package, extra=extra, purpose=purpose) from None
+
+
+def expect_arrays(record: Any) -> None:
+    """Make sure that the arrays in a dataclass have the shapes and types of their annotations.
+
+    Args:
+        record: An instance; axes of one name must agree in all its fields.
+
+    Raises:
+        ShapeError: They have others; the first is named.
+    """
+    from jaxtyping import jaxtyped  # pyright: ignore[reportUnknownVariableType]
+
+    with jaxtyped("context"):
+        for field in dataclasses.fields(record):
+            value: Any = getattr(record, field.name)
+            if holds_arrays(field.type) and not isinstance(value, cast(type, field.type)):
+                raise wrong_array(f"`{field.name}` of {type(record).__name__}", value, field.type)
+
+
+def wrong_array(what: str, value: Any, kind: Any) -> ShapeError:
+    """The error about an array that has not the annotated shape or type."""
+    kinds = (kind,) if isinstance(kind, type) else kind.__args__
+    names = ["None" if one is type(None) else one.__name__ for one in kinds]
+    got = type(value).__name__
+    if (shape := getattr(value, "shape", None)) is not None:
+        got += f" {value.dtype} of shape {tuple(shape)}"
+    return ShapeError(
+        f"{what} has another shape or type",
+        got=got,
+        do=f"give {' or '.join(names)}; axes of one name agree",
+    )
+
+
+def holds_arrays(kind: Any) -> bool:
+    """Whether an annotation is an array of jaxtyping, or a union of such with other classes."""
+    from jaxtyping import AbstractArray
+
+    kinds = (kind,) if isinstance(kind, type) else getattr(kind, "__args__", ())
+    classes = [one for one in kinds if isinstance(one, type)]
+    return len(classes) == len(kinds) and any(issubclass(one, AbstractArray) for one in classes)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int8, Int64, Shaped
 
-from sharpfield.core.errors import CaptureError
+from sharpfield.core.errors import CaptureError, expect_arrays
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,7 @@ def checked(events: EventStream, where: object) -> EventStream:
         where: The file, for the message.
 
     Raises:
+        ShapeError: A column is no array, or has another type than its annotation.
         CaptureError: Counts differ, times are not ascending, a coordinate is not finite or lies
             outside the sensor, a polarity is neither -1 nor +1, or a track is not one of `tracks`.
     """
@@ -113,6 +114,7 @@ def checked(events: EventStream, where: object) -> EventStream:
             got=f"x {len(events.x)}, y {len(events.y)}, t {len(events.t_us)}, p {len(events.p)}",
             do="the file may be truncated: copy or convert it again",
         )
+    expect_arrays(events)
     if not len(events):
         return events
     back = np.flatnonzero(np.diff(events.t_us) < 0)

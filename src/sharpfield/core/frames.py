@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8, UInt16
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.errors import CaptureError
+from sharpfield.core.errors import CaptureError, expect_arrays
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Exposure:
     those of the first row."""
 
     def __post_init__(self) -> None:
+        expect_arrays(self)
         wrong = np.flatnonzero(self.close_us < self.open_us)
         if len(wrong):
             i = wrong[0]
@@ -122,6 +123,9 @@ class Frames:
                 "there must be one exposure, track and name for each image",
                 got=", ".join(f"{count} {name}" for name, count in counts.items()),
             )
+        expect_arrays(self)
+        if self.channels not in (1, 3):
+            raise CaptureError("images are grey or RGB", got=f"{self.channels} channels")
         if self.encoding not in ENCODINGS:
             raise CaptureError(
                 "unknown image encoding", got=self.encoding, do=f"use one of {', '.join(ENCODINGS)}"

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Clock
-from sharpfield.core.errors import CaptureError
+from sharpfield.core.errors import CaptureError, ShapeError
 from sharpfield.core.protocols import Trajectory
 from sharpfield.geometry import se3, spline
 from sharpfield.geometry.space import Similarity
@@ -26,8 +26,16 @@ def check_poses(poses: Float[np.ndarray, "p 3 4"], where: object = "poses") -> N
     """Make sure that poses are finite and their rotations orthonormal and right-handed.
 
     Raises:
+        ShapeError: The array has another shape.
         CaptureError: They are not; the first bad one is named.
     """
+    if np.shape(poses)[1:] != (3, 4):
+        raise ShapeError(
+            "poses have another shape",
+            where=where,
+            got=np.shape(poses),
+            do="give an array of shape (n, 3, 4), world-from-camera",
+        )
     wrong = np.flatnonzero(~np.isfinite(poses).all((1, 2)))
     if len(wrong):
         raise CaptureError("a pose holds NaN or infinity", where=f"{where}, pose {wrong[0]}")

@@ -32,6 +32,7 @@ def write(capture: "Capture", folder: Path | str, layout: str = "native") -> Non
         CaptureError: The folder holds something else, or the capture holds something the layout
             has no place for.
     """
+    expect_capture(capture)
     if layout not in WRITERS:
         raise OptionError(
             "unknown layout to write",
@@ -39,3 +40,24 @@ def write(capture: "Capture", folder: Path | str, layout: str = "native") -> Non
             do=did_you_mean(layout, WRITERS),
         )
     import_module(f"sharpfield.captures.{WRITERS[layout]}").write(capture, Path(folder))
+
+
+def expect_capture(capture: object) -> None:
+    """Make sure that this is a capture, and that its events are valid; it may be made by hand.
+
+    Raises:
+        OptionError: It is something else.
+        ShapeError: A column of its events has another type.
+        CaptureError: Its events are not valid.
+    """
+    from sharpfield.core.capture import Capture
+    from sharpfield.core.events import checked
+
+    if not isinstance(capture, Capture):
+        raise OptionError(
+            "this is not a capture",
+            got=type(capture).__name__,
+            do="give what sf.read or sf.simulate return; sf.train also takes a folder",
+        )
+    if capture.events is not None:
+        checked(capture.events, capture.name)
