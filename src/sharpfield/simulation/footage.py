@@ -154,7 +154,7 @@ def simulate_footage(
         seed: Of the sensors' differences and noise.
 
     Returns:
-        A capture whose poses and lens are placeholders, which its notes say; frames have the
+        A capture whose poses, lens and depth bounds are placeholders; frames have the
         image at mid exposure as their truth.
     """
     every, times = every or group, footage.times_us
