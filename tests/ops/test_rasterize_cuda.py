@@ -17,7 +17,7 @@ from sharpfield.ops import _dispatch
 from sharpfield.ops import rasterizer as definition
 from sharpfield.ops._dispatch import using
 from sharpfield.ops.rasterizer import WIDEN, Canvas, Splats, rasterize
-from tests.ops.test_rasterize import CAMERA, scene
+from tests.ops.test_rasterizer import CAMERA, scene
 
 POSES = torch.eye(3, 4).repeat(2, 1, 1)
 POSES[1] = torch.tensor([[0.96, 0, -0.28, 0.3], [0, 1, 0, -0.1], [0.28, 0, 0.96, 0.2]])
