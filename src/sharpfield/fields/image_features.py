@@ -1,9 +1,9 @@
-"""What images of a scene show at places in it, and how it joins what the places know themselves.
+"""Image-based features: features of posed images, projected to positions and merged with their own.
 
-Every *source*, a image with a known pose, is turned into *levels*: the image itself, and three
-maps of features at a half, a quarter and an eighth of its size. A place is looked up in each; what
-several sources say of it is *merged* by learned weights, and a residual network *mixes* the result
-into the place's own feature.
+Every *source*, an image with a known pose, is encoded to *levels*: the image itself, and three
+feature maps at a half, a quarter and an eighth of its size. A position is projected to each source
+and sampled there; the features of several sources are *merged* with learned weights, and a residual
+network *mixes* the result into the position's own feature.
 
 Source: Hybrid Neural Rendering (CVPR 2023), section 3.1; sizes from the released code.
 """
@@ -19,7 +19,7 @@ MAPS = (6, 12, 24)
 """Channels of the three maps."""
 
 MERGED = 1e-6
-"""Added to the sum of weights, so that places no source shows get zero."""
+"""Added to the sum of weights, so that positions outside all sources get zero."""
 
 
 class FeatureExtractor(nn.Module):
@@ -58,11 +58,11 @@ class FeatureExtractor(nn.Module):
 
 
 class Merging(nn.Module):
-    """How much each source counts at a place.
+    """Learned weights of sources at positions.
 
     Args:
-        looked: Width of what a source shows.
-        feature: Width of a place's own feature.
+        looked: Width of the features of a source.
+        feature: Width of a position's own feature.
         width: Of the hidden layers.
         seed: Of the run.
     """
@@ -80,13 +80,13 @@ class Merging(nn.Module):
         change: Float[Tensor, "n v 3"],
         visible: Float[Tensor, "n v"],
     ) -> tuple[Float[Tensor, "n f"], Float[Tensor, "n v"]]:
-        """What the sources say together, and the weights they were given.
+        """Merged features of the sources, and the weights of the sources.
 
         Args:
-            shown: By each source.
-            feature: Of each place.
-            change: Unit direction from the source to the place, minus that of the ray.
-            visible: Factor on the weights; 0 outside of a image.
+            shown: Features of each source.
+            feature: Of each position.
+            change: Unit direction from the source to the position, minus that of the ray.
+            visible: Factor on the weights; 0 outside of an image.
         """
         own = self.network.first(feature, skipped=shown.shape[-1])  # once for all sources
         both = self.network.first(shown) + own[:, None]
@@ -98,10 +98,10 @@ class Merging(nn.Module):
 
 
 class Mixing(nn.Module):
-    """Adds to the first features of a place what its own and the merged ones make together.
+    """Residual network from own and merged features to a change of the first own features.
 
     Args:
-        looked: Width of what sources show; so many features change.
+        looked: Width of the features of sources, and of the part that changes.
         seed: Of the run.
     """
 
@@ -115,6 +115,6 @@ class Mixing(nn.Module):
     def forward(
         self, feature: Float[Tensor, "n r"], merged: Float[Tensor, "n f"]
     ) -> Float[Tensor, "n r"]:
-        """The feature with what images know of it."""
+        """The feature after the residual update."""
         first, others = feature[:, : self.looked], feature[:, self.looked :]
         return torch.cat([first + self.network(first, merged.to(first.dtype)), others], -1)

@@ -1,11 +1,11 @@
-"""How far things moved while a frame was exposed, measured from events: its blur, in px.
+"""Motion blur of a frame in px, measured from the events of its exposure.
 
-Within a short part of an exposure a point moves a little, and the light of a pixel changes by the
-slope of the image times the shift: change = -slope . shift. Events are that change. The slope is
-that of the sharp image at the time, which the event double integral gives from the blurred frame
-and the events. So shifts follow, block by block, by least squares; the sum of their lengths over
-the exposure is the *travel*, and the blur of a frame is the mean over its blocks. No depth, no
-poses, no other frame.
+Within a short part of an exposure the image shifts a little, and the log light of a pixel changes
+by the image gradient times the shift: change = -gradient . shift. Events measure that change. The
+gradient is that of the sharp image at the time, which the event double integral gives from the
+blurred frame and the events. So shifts follow, block by block, by least squares; the sum of their
+lengths over the exposure is the *travel*, and the blur of a frame is the mean over its blocks. No
+depth, poses or other frames are needed.
 
 Source: the optical flow constraint of Lucas and Kanade (IJCAI 1981) with events for the temporal
 derivative; Pan et al., *Bringing a blurry frame alive at high frame-rate* (CVPR 2019) for the
@@ -25,11 +25,12 @@ PARTS = 16
 BLOCKS = 6
 """Blocks along the shorter side of the image."""
 DARK = 0.02
-"""Added to light before logarithms, as a share of white."""
+"""Added to light before logarithms, as a fraction of white."""
 SMOOTHING_PX = 1.0
-"""Standard deviation of the blur that slopes and changes are looked at through."""
+"""Standard deviation of the Gaussian applied to the image and to the changes."""
 HOLD = 0.05
-"""Pull of a block's shift towards that of the whole image, as a share of the mean slope."""
+"""Regularisation of a block's shift towards that of the whole image, relative to the mean squared
+gradient."""
 
 
 def event_blur(
@@ -39,7 +40,7 @@ def event_blur(
 
     Args:
         capture: With frames and events of one camera.
-        frames: Which; by default those that are learned from.
+        frames: Which; by default the training frames.
 
     Raises:
         CaptureError: There are no events, or they are of several cameras.
@@ -56,7 +57,7 @@ def _travel(capture: Capture, frame: int) -> float:
     if not np.abs(changes).any():
         return 0.0
     light = _light(capture, frame)
-    # Log light at the edges of the parts, against the first; the frame is the mean of all.
+    # Log light at the borders of the parts, relative to the first; the frame is the mean of all.
     since = np.concatenate([np.zeros_like(changes[:1]), np.cumsum(changes, 0)])
     start = np.log(light) - np.log(np.exp(0.5 * (since[1:] + since[:-1])).mean(0))
     total = 0.0
@@ -75,10 +76,10 @@ def _changes(capture: Capture, frame: int) -> Float32[np.ndarray, "k h w"]:
     part = (inside.t_us - opens) * PARTS // max(closes - opens, 1)
     column = np.clip(np.floor(inside.x), 0, camera.width - 1).astype(np.int64)
     row = np.clip(np.floor(inside.y), 0, camera.height - 1).astype(np.int64)
-    place = (part.clip(0, PARTS - 1) * camera.height + row) * camera.width + column
+    at = (part.clip(0, PARTS - 1) * camera.height + row) * camera.width + column
     step = np.where(np.asarray(inside.p) > 0, on, -off)
     shape = PARTS, camera.height, camera.width
-    return np.bincount(place, step, int(np.prod(shape))).reshape(shape).astype(np.float32)
+    return np.bincount(at, step, int(np.prod(shape))).reshape(shape).astype(np.float32)
 
 
 def _light(capture: Capture, frame: int) -> Float32[np.ndarray, "h w"]:
@@ -92,7 +93,7 @@ def _light(capture: Capture, frame: int) -> Float32[np.ndarray, "h w"]:
 def _shifts(
     log_light: Float32[np.ndarray, "h w"], change: Float32[np.ndarray, "h w"]
 ) -> Float64[np.ndarray, "q 2"]:
-    """Shift of each block in px: least squares of change = -slope . shift."""
+    """Shift of each block in px: least squares of change = -gradient . shift (Lucas-Kanade)."""
     smooth, changed = (
         cv2.GaussianBlur(one.astype(np.float32), (0, 0), SMOOTHING_PX)
         for one in (log_light, change)
@@ -111,7 +112,7 @@ def _shifts(
 
 
 def _blocks(values: Float64[np.ndarray, "h w"], side: int) -> Float64[np.ndarray, "q"]:
-    """Means over square blocks; what is left over at the right and below is left out."""
+    """Means over square blocks; the rest at the right and the bottom is left out."""
     rows, columns = values.shape[0] // side, values.shape[1] // side
     cut = values[: rows * side, : columns * side].reshape(rows, side, columns, side)
     return cut.mean((1, 3)).ravel()

@@ -1,4 +1,4 @@
-"""How alike two images are: PSNR, and SSIM in the definitions that papers print.
+"""Image metrics: PSNR, SSIM in three definitions, sharpness without reference, event counts.
 
 All functions take images `[h w c]` with values 0...1 in the display domain (as files store
 them), compare them channel by channel, and compute in float64. SSIM comes in three settings that
@@ -11,12 +11,9 @@ give *different numbers for the same images*, so a table has to say which one it
   Ev-DeblurNeRF): as `ssim_uniform`, but of images mapped to -1...1 with range 2. Local means then
   lie around zero, and its luminance term punishes grey regions; it is often much lower.
 
-How sharp a image is, without another to compare it to.
-
-Both numbers grow with contrast and noise as well as with sharpness, so they order images of the
-same scene under the same light, and mean nothing on their own.
-
-How well predicted events match measured ones, by their numbers at each pixel.
+Sharpness without a reference, `laplacian_variance` and `gradient_energy`, grows with contrast and
+noise, too, so it orders images of the same scene under the same light, and means nothing on its
+own. `relative_count_error` compares predicted with measured events by their counts at each pixel.
 """
 
 import torch
@@ -133,9 +130,9 @@ def gradient_energy(image: Float[Tensor, "h w c"]) -> Float[Tensor, ""]:
 def relative_count_error(
     predicted: Float[Tensor, "*b h w"], measured: Float[Tensor, "*b h w"]
 ) -> Float[Tensor, ""]:
-    """Absolute differences of event counts as a share of all measured events.
+    """Sum of absolute differences of event counts over the number of measured events.
 
-    0 is perfect; 1 is what predicting no event at all gets. Infinite if nothing was measured.
+    0 is perfect; predicting no event at all gives 1. Infinite if nothing was measured.
 
     Args:
         predicted: Number of events at each pixel; give signs and time windows as leading axes,

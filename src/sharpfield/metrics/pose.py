@@ -1,4 +1,4 @@
-"""How well an estimated trajectory matches a known one.
+"""Errors of an estimated trajectory against a known one.
 
 Poses are world-from-camera `[n 3 4]`. An estimate from images alone is known only up to a
 similarity (Sim(3)); `align` finds the one that brings the camera centres together.

@@ -1,17 +1,16 @@
-"""How sharp the frames of a video are, told apart from what they show; and what weight that earns.
+"""Sharpness of the frames of a video, independent of their content, and training weights from it.
 
-The *response* of a image says how it bends: second derivatives of its local mean. Their variance
-falls with blur, but also differs from place to place. So two frames are compared only where they
-show the same (their *overlap*), and comparisons of neighbours are put together to one *score* for
-each frame. Scores are relative: their unit means nothing. *Weights* compare a frame with those
-around it and are 1 on average.
+The *response* of an image is the second derivative of its local mean. Its variance falls with blur,
+but also depends on the content. So two frames are compared only where they show the same (their
+*overlap*), and comparisons of neighbours are combined to one *score* for each frame. Scores are
+relative: they have no unit. *Weights* compare a frame with those around it and are 1 on average.
 
 Source: Hybrid Neural Rendering (CVPR 2023), content-aware blur detection; its released code for
 the numbers. There, the response is a Laplacian, overlaps come from learned optical flow, each frame
 is compared with the next, and ratios are multiplied along the video (`chained`), which drifts. Here
-(`reconciled`), the response is looked at across and down, since shake blurs one way; overlaps come
-from depth where it is known, else from DIS flow; and comparisons with several neighbours, and
-faintly with the image's own variance, are brought to agree.
+(`reconciled`), responses across and down are separate, since motion blur has a direction; overlaps
+come from depth where it is known, else from DIS flow; and scores are a least-squares fit to
+comparisons with several neighbours and, with a small weight, to the image's own variance.
 """
 
 from collections import deque
@@ -35,32 +34,32 @@ WIDTH = 640
 SMOOTHED, SMOOTHED_PUBLISHED = 3, 5
 """Side of the mean filter, in px."""
 WINDOW, STRIDE = 10, 5
-"""Frames that a weight compares, and from one such window to the next."""
+"""Frames within which a weight compares, and the step from one such window to the next."""
 NEIGHBOURS = 4
 """Each frame is compared with so many after it."""
 ANCHORS = {"depth": 0.05, "flow": 0.2}
-"""How much a image's own variance counts against one comparison; flow errs more than depth."""
+"""Weight of an image's own variance against one comparison; flow is less accurate than depth."""
 LEAST_SHARE = 0.02
-"""Comparisons over a smaller share of the image are left out."""
+"""Comparisons over a smaller fraction of the image are left out."""
 TINY = 1e-9
 
 Means = Literal["auto", "depth", "flow"]
-"""Where overlaps come from; "auto" takes depth where the capture has it."""
+"""Source of overlaps; "auto" is depth where the capture has it, else flow."""
 Way = Literal["reconciled", "published"]
 Judge = Literal["published", "auto", "images", "events"]
 """What weighs frames: images as published; events where there are any, else images; images; events.
 """
 Source = Literal["auto", "images", "events"]
-"""What tells how sharp a frame is; "auto" takes events where the capture has them."""
+"""Source of the sharpness of frames; "auto" is events where the capture has them, else images."""
 SOFTEST_PX = 0.5
-"""Blur that no lens or pixel is without: added to the measured one."""
+"""Blur of any lens and pixel, added to the measured motion blur."""
 
 
 Image = UInt8[np.ndarray, "h w"]
 Response = Float32[np.ndarray, "h w"]
 Responses = Sequence[Response] | Mapping[int, Response]
 Seen = Callable[[int, int, Image, Image], Overlap]
-"""What two frames, given by their positions and images, both show."""
+"""The overlap of two frames, given by their positions and images."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ class Comparison:
     first: float
     second: float
     share: float
-    """How much of the image both show."""
+    """Overlap as a fraction of the image."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class Quality:
     frames: Int64[np.ndarray, "m"]
     """Their indices."""
     scores: Float64[np.ndarray, "m"]
-    """The larger, the sharper."""
+    """Larger is sharper."""
     weights: Float64[np.ndarray, "m"]
 
 
@@ -94,16 +93,16 @@ def frame_quality(
     overlap: Means = "auto",
     way: Way = "reconciled",
 ) -> Quality:
-    """Scores and weights of frames, judged by their images.
+    """Scores and weights of frames, from their images.
 
     Args:
         capture: A video: frames are compared with those that follow.
-        frames: Which, in order of time; by default those that are learned from.
-        overlap: How to find what two frames both show.
+        frames: Which, in order of time; by default the training frames.
+        overlap: How to find the overlap of two frames.
         way: "published" compares each frame with the next only and multiplies.
 
     Raises:
-        OptionError: Overlaps shall come from depth, and there is none.
+        OptionError: `overlap` is "depth", and there is none.
     """
     chosen = capture.split.train if frames is None else frames
     if overlap == "depth" and capture.depth is None:
@@ -124,9 +123,9 @@ def frame_quality(
 
 
 def event_quality(capture: Capture, *, frames: Int64[np.ndarray, "m"] | None = None) -> Quality:
-    """Scores and weights of frames, judged by the events of their exposures.
+    """Scores and weights of frames, from the events of their exposures.
 
-    A score is one over the blur in px, see `metrics.blur_from_events`.
+    A score is the inverse of the blur in px, see `metrics.blur_from_events`.
 
     Raises:
         CaptureError: There are no events, or they are of several cameras.
@@ -137,11 +136,11 @@ def event_quality(capture: Capture, *, frames: Int64[np.ndarray, "m"] | None = N
 
 
 def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.ndarray, "n"]:
-    """A weight for each frame: about 1 on average over those learned from, and 1 for the others.
+    """A weight for each frame: about 1 on average over training frames, and 1 for the others.
 
     Args:
         capture: With frames, and for "events" with events.
-        source: What tells.
+        source: Of the sharpness.
 
     Raises:
         CaptureError: There are no events, or they are of several cameras.
@@ -157,7 +156,7 @@ def quality_weights(capture: Capture, *, source: Source = "auto") -> Float64[np.
 
 
 def frame_weights(capture: Capture, judge: Judge) -> Float64[np.ndarray, "n"]:
-    """A weight for each frame: about 1 on average over those learned from, and 1 for the others.
+    """A weight for each frame: about 1 on average over training frames, and 1 for the others.
 
     Weights that come from images take long for long captures and are cached on disk.
 
@@ -217,7 +216,7 @@ def _reconciled(images: Iterable[Image], seen: Seen, *, anchor: float) -> Float6
 
 
 def grey(frames: Frames, frame: int) -> UInt8[np.ndarray, "h w"]:
-    """A frame as it is compared: stored values, grey, 640 px wide."""
+    """A frame for comparison: stored values, grey, 640 px wide."""
     image = np.asarray(frames.images[frame])
     if image.dtype != np.uint8:
         image = np.rint(image * (255.0 / frames.white)).astype(np.uint8)
@@ -242,13 +241,13 @@ def bending(image: Image) -> tuple[Response, Response]:
 
 
 def compared(i: int, j: int, responses: Responses, both: Overlap) -> Comparison:
-    """How the responses of two frames vary over what both show.
+    """Variance of the responses of two frames over their overlap.
 
     Args:
         i: The first.
         j: The second.
         responses: Of both, by these numbers.
-        both: Where the first frame shows the same as the second.
+        both: The overlap of the first frame with the second.
     """
     if not len(both.here):
         return Comparison(i, j, 0.0, 0.0, 0.0)
@@ -278,9 +277,9 @@ def reconciled(
     """Scores that agree best with all comparisons, by least squares on their logarithms.
 
     Args:
-        own: Variance of each whole image: a faint hint, without which the scale were free.
+        own: Variance of each whole image: a weak prior, which fixes the common scale.
         comparisons: Of any pairs of frames.
-        anchor: How much that hint counts against a comparison of whole images.
+        anchor: Weight of that prior against a comparison of whole images.
     """
     system, right = np.diag(np.full(len(own), anchor)), anchor * np.log(own + TINY)
     for pair in comparisons:
@@ -297,7 +296,7 @@ def reconciled(
 def window_weights(
     scores: Float64[np.ndarray, "m"], *, length: int = WINDOW, stride: int = STRIDE
 ) -> Float64[np.ndarray, "m"]:
-    """Scores over the mean of those around: windows overlap, and their weights are averaged.
+    """Scores over their mean in a sliding window; windows overlap, and their weights are averaged.
 
     Args:
         scores: Of frames in order of time.

@@ -1,4 +1,4 @@
-"""Which pixels of two images show the same: by measured depth and poses, or by optical flow."""
+"""Overlap of two images: pixels of the same point, by depth and poses, or by optical flow."""
 
 from dataclasses import dataclass
 
@@ -10,33 +10,33 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from sharpfield.core.capture import Capture
 
 EVERY = 4
-"""One pixel in so many, along both axes, is looked up."""
+"""Stride of the pixels that are used, along both axes."""
 BORDER = 20 / 640
-"""Share of the width that is left out at each border."""
+"""Margin that is left out at each border, as a fraction of the width."""
 SAME_DEPTH = 0.05
-"""Depths that differ by less than this share are of one surface."""
+"""Depths with a smaller relative difference are of the same surface."""
 FLOW_SHRINK = 2
-"""Flow is found in images so many times smaller."""
+"""Factor by which images are downscaled for optical flow."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Pixels of one image, and where another shows the same."""
+    """Pixels of one image, and the corresponding pixels of another."""
 
     here: Int64[np.ndarray, "q 2"]
     """Rows and columns."""
     there: Int64[np.ndarray, "q 2"]
     share: float
-    """Of the pixels looked up, how many are shown by both."""
+    """Fraction of the sampled pixels that are visible in both."""
 
 
 def depth_overlap(capture: Capture, first: int, second: int, size: tuple[int, int]) -> Overlap:
-    """What two frames both show, by depth and poses; hidden surfaces do not count.
+    """Overlap of two frames, by depth and poses; occluded points do not count.
 
     Args:
         capture: With depth.
-        first: The frame whose pixels are looked up.
-        second: The frame in which they are found.
+        first: The frame whose pixels are projected.
+        second: The frame to which they are projected.
         size: Width and height of the images to compare, of the same field of view.
     """
     camera, depth = capture.camera, capture.needed_depth
@@ -59,7 +59,7 @@ def depth_overlap(capture: Capture, first: int, second: int, size: tuple[int, in
 
 
 def flow_overlap(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> Overlap:
-    """What two grey images both show, by dense optical flow (DIS).
+    """Overlap of two grey images, by dense optical flow (DIS).
 
     Source: Kroeger et al., "Fast optical flow using dense inverse search" (ECCV 2016).
     """
@@ -76,7 +76,7 @@ def flow_overlap(first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w
 
 
 def _lattice(size: tuple[int, int]) -> Int64[np.ndarray, "q 2"]:
-    """Rows and columns of every so many-th pixel."""
+    """Rows and columns of every `EVERY`-th pixel."""
     rows, columns = (np.arange(EVERY // 2, side, EVERY) for side in size[::-1])
     return np.stack(np.meshgrid(rows, columns, indexing="ij"), -1).reshape(-1, 2).astype(np.int64)
 
@@ -90,8 +90,8 @@ def _kept(
     """Pairs away from the borders of both images."""
     border = round(BORDER * size[0])
     least, most = border, np.array(size)[::-1] - border
-    for place in (here, there):
-        good = good & ((place >= least) & (place < most)).all(1)
+    for pixel in (here, there):
+        good = good & ((pixel >= least) & (pixel < most)).all(1)
     return Overlap(here[good], there[good], float(good.mean()))
 
 

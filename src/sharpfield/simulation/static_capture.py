@@ -1,9 +1,8 @@
-"""One call from a scene to a capture: blurry frames, events, poses and sharp truth on one clock.
+"""Simulated captures of static scenes: blurry frames, events, poses and sharp truth on one clock.
 
 Frames follow the published Ev-DeblurNeRF data: one exposure every interval, blurred by the
-camera's motion, but every eighth a sharp view at the middle of its slot, held out for testing.
-
-A frame camera and an event camera that look at the same images.
+camera's motion, but every eighth a sharp view at the middle of its slot, held out for testing. The
+frame camera and the event camera share pose and lens.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +30,7 @@ from sharpfield.simulation.sensors.frames import Exposing, FrameSensor, store
 
 
 class Recorder:
-    """Blurry frames, their sharp truth, and events, from images shown one after the other."""
+    """Blurry frames, their sharp truth, and events, from a sequence of images."""
 
     def __init__(
         self,
@@ -87,16 +86,16 @@ class Recorder:
 P = TypeVar("P")
 
 AHEAD = 32
-"""Images drawn ahead by all cores; bounds memory."""
+"""Images rendered ahead by all cores; bounds memory."""
 MARGIN_US = 10_000
-"""The camera is watched for this long before the first exposure and after the last."""
+"""The recording begins this long before the first exposure, and ends this long after the last."""
 FOCAL_OF_WIDTH = 0.92
 """Focal length of the simulated camera over the image width: 57 degrees across."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When the shutter opens, and how finely light is sampled."""
+    """Times of the exposures, and of the images from which light is integrated."""
 
     frames: int = 18
     exposure_us: int = 50_000
@@ -106,12 +105,12 @@ class Timing:
     step_us: int = 1000
     """Between two images of the scene: 1000 for a camera of 1000 images per second."""
     most_change: float = 0.0
-    """Largest change of log intensity between two images, which are placed closer where it is
-    exceeded; 0 for even steps."""
+    """Largest change of log intensity between two images; where it is exceeded, images in between
+    are rendered. 0 for even steps."""
     test_every: int = 8
-    """Every how many frames one is sharp and held out, the first included; 0 for none."""
+    """One frame in so many is sharp and held out, the first included; 0 for none."""
     readout_us: int = 0
-    """The camera is watched for this much longer, while a rolling shutter reads the last frame."""
+    """The recording is longer by this, while a rolling shutter reads the last frame."""
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.exposure_us < 0 or self.step_us < 1:
@@ -153,7 +152,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Rig:
-    """What records: the two sensors that share a lens."""
+    """The two sensors, which share a lens."""
 
     size: tuple[int, int] = (240, 160)
     """Width and height in px, of both."""
@@ -163,7 +162,7 @@ class Rig:
     """Focal length over the image width."""
     lens: str = "pinhole"
     distortion: tuple[float, ...] = ()
-    """See `Camera`; what the camera sees must lie before it."""
+    """See `Camera`; the field of view must be below 180 degrees."""
 
     def camera(self) -> Camera:
         """A camera with square pixels."""
@@ -189,7 +188,7 @@ def simulate(
 
     Args:
         place: A scene, or the name of one.
-        path: A camera path, or the name of one, which is then drawn from the seed.
+        path: A camera path, or the name of one, which then depends on the seed.
         rig: Sensors and their numbers.
         timing: Frames, exposures and sampling.
         seed: Of the path, the sensors' differences and their noise.
@@ -223,7 +222,7 @@ def simulate(
 def record(
     place: Scene, path: CameraPath, rig: Rig, timing: Timing, exposure: Exposure, *, seed: int
 ) -> Recorder:
-    """Both cameras of a rig after a whole recording; seed: of their differences and noise."""
+    """Record with both cameras of a rig; seed: of pixel differences and noise."""
     recorder = Recorder(
         rig.size,
         exposure,
@@ -271,7 +270,7 @@ def images(
 
 
 def drawn_ahead(draw: Callable[[int], P], times_us: Sequence[int]) -> Iterator[P]:
-    """Images at some times, in their order, drawn by all cores."""
+    """Images at some times, in their order, rendered by all cores."""
     with ThreadPoolExecutor(cpu_count()) as pool:
         for first in range(0, len(times_us), AHEAD):
             yield from pool.map(draw, times_us[first : first + AHEAD])
@@ -279,6 +278,6 @@ def drawn_ahead(draw: Callable[[int], P], times_us: Sequence[int]) -> Iterator[P
 
 @lru_cache(maxsize=4)
 def _directions(camera: Camera) -> Float64[np.ndarray, "n 3"]:
-    """Directions seen by all pixels, with a z of 1, in camera axes."""
+    """Directions of all pixels, with a z of 1, in camera axes."""
     unit = camera.direction(camera.grid().double()).reshape(-1, 3).numpy()
     return np.ascontiguousarray(unit / unit[:, 2:])

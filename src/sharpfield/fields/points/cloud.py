@@ -1,8 +1,8 @@
-"""A cloud of points that have learned something about the surface around them.
+"""Neural points: a point cloud with learned attributes.
 
-A *neural point* has a place, which stays, and *attributes*, which are learned: a *descriptor* that
-networks read, a *confidence* that it is on a surface, a colour, and the direction from which it was
-first seen. Values are those that frames store, not light.
+A *neural point* has a fixed position and learned *attributes*: a *descriptor*, which is the input
+of networks, a *confidence* that it is on a surface, a colour, and the direction from which it was
+first seen. Colours are stored values, not light.
 
 Source: Point-NeRF (CVPR 2022), section 3; attributes as in the released code of Hybrid Neural
 Rendering (CVPR 2023).
@@ -19,16 +19,16 @@ from sharpfield.ops.knn import Cells, sort_into_cells
 from sharpfield.ops.sparse_rows import take_rows
 
 LEAST_CONFIDENCE = 1e-4
-"""Confidences count as at least this and at most 1, but are free to move."""
+"""Confidences are clamped to at least this and at most 1 where used; their gradients pass."""
 
 
 @dataclass(frozen=True)
 class Attributes:
-    """What some points have learned."""
+    """Attributes of some points."""
 
     descriptors: Float[Tensor, "n f"]
     confidence: Float[Tensor, "n 1"]
-    """As it counts: bounded."""
+    """Clamped."""
     colours: Float[Tensor, "n c"]
     directions: Float[Tensor, "n 3"]
 
@@ -79,18 +79,18 @@ class NeuralPoints(nn.Module):
         confidence: float = 1.0,
         spread: float = 0.5,
     ) -> "NeuralPoints":
-        """Points whose descriptors are drawn evenly from -`spread` to `spread`."""
+        """Points whose descriptors are uniform from -`spread` to `spread`."""
         count = len(positions)
         descriptors = spread * (2 * torch.rand(count, channels, generator=generator) - 1)
         sure = torch.full((count, 1), confidence)
         return cls(positions, descriptors, sure, colours, directions, cell=cell)
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of points."""
         return len(self.positions)
 
     def cells(self) -> Cells:
-        """The lists in which neighbours are looked up, made anew when the points are others."""
+        """The cell lists for neighbour queries, rebuilt when the points have changed."""
         held = self.positions
         stamp = (held.data_ptr(), held._version, len(held))
         if self._sorted is None or self._sorted[0] != stamp:
@@ -109,11 +109,11 @@ class NeuralPoints(nn.Module):
         )
 
     def points(self) -> dict[str, Tensor]:
-        """What has one row for each point, by the name of its parameter or buffer."""
+        """All parameters and buffers with one row for each point, by name."""
         return {"positions": self.positions, **dict(self.named_parameters())}
 
     def replace(self, points: Mapping[str, Tensor]) -> None:
-        """Become other points, of any number; all parameters are new objects.
+        """Replace all points, by any number of others; all parameters are new objects.
 
         Args:
             points: By the names of `points`, with the same rows.

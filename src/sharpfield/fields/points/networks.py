@@ -1,9 +1,9 @@
-"""From the neural points around a place to density, to a feature, and to colour.
+"""Networks of a neural point field: density, feature and colour from the points around a position.
 
-Each neighbour is read by two small networks: the first sees its descriptor and the way to it, the
-second also its colour and the direction it was seen from. What they say is averaged, nearer
-neighbours counting more and unsure ones less; then a third network sees the viewing direction and
-makes the *feature*, from which one layer makes the colour.
+Two small networks process each neighbour: the first reads its descriptor and the offset to it, the
+second also its colour and the direction from which it was seen. Their outputs are averaged with
+weights by inverse distance and confidence; a third network adds the viewing direction and gives the
+*feature*, from which one layer computes the colour.
 
 Source: Point-NeRF (CVPR 2022), section 4; sizes and order of inputs from the released code of
 Hybrid Neural Rendering (CVPR 2023).
@@ -23,10 +23,10 @@ from sharpfield.ops.knn import first_near, neighbours
 from sharpfield.ops.sparse_rows import compact, take_rows
 
 NEAREST = 1e-6
-"""Neighbours count as at least this far away, in world units."""
+"""Smallest distance of a neighbour in the weights, in world units."""
 
 RIM = (1.002, -0.001)
-"""Colours are this times a sigmoid, plus that: black and white can be reached."""
+"""Factor and offset of the sigmoid of colours, so that black and white can be reached."""
 
 
 @dataclass(frozen=True)
@@ -36,23 +36,23 @@ class PointSizes:
     channels: int = 32
     """Of a descriptor."""
     width: int = 256
-    """Of the networks that read neighbours."""
+    """Of the networks of neighbours."""
     feature: int = 128
-    """Of the network that sees the viewing direction."""
+    """Of the network with the viewing direction."""
     octaves: tuple[int, int, int] = (3, 5, 4)
-    """Frequencies in the encoding of descriptors, of ways to neighbours, and of directions."""
+    """Frequencies in the encoding of descriptors, of offsets to neighbours, and of directions."""
     axes: Literal["camera", "world"] = "camera"
-    """Ways are told along the camera's axes as well as the world's, and directions reach up to the
-    plane at depth 1, as published; or world and unit directions alone."""
+    """Offsets are given along the camera's axes and the world's, and directions end at the plane at
+    depth 1, as published; or only along the world's, with unit directions."""
     average: Literal["late", "early"] = "late"
     """Neighbours are averaged after both networks, as published, or after their first layers, which
     costs a fraction."""
     unit: float = 1.0
-    """Ways are told in this many world units."""
+    """Unit of offsets, in world units."""
     neighbours: int = 8
-    """Most that are asked."""
+    """Most neighbours of a position."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """What the networks compute in."""
+    """Of the computation of the networks."""
 
 
 def interleaved(x: Float[Tensor, "*b d"], octaves: int) -> Float[Tensor, "*b f"]:
@@ -68,11 +68,11 @@ def waves(x: Float[Tensor, "*b d"], octaves: int) -> Float[Tensor, "*b f"]:
 
 
 class PointField(nn.Module):
-    """Neural points with the networks that read them.
+    """Neural points with their networks.
 
     Args:
         sizes: Of the networks.
-        points: What is read.
+        points: The neural points.
         radius: Neighbours are closer than this.
         seed: Of the run.
     """
@@ -101,13 +101,13 @@ class PointField(nn.Module):
         place: Float[Tensor, "b d"],
         most: int,
     ) -> tuple[Int64[Tensor, "b s"], Float[Tensor, "b s 3"]]:
-        """The first places on rays that lie near points, see `ops.knn.first_near`."""
+        """The first samples on rays that are near points, see `ops.knn.first_near`."""
         return first_near(origin, direction, place, self.points.cells(), most)
 
     def neighbours(
         self, places: Float[Tensor, "q 3"]
     ) -> tuple[Int64[Tensor, "q k"], Float[Tensor, "q k 3"]]:
-        """Rows of the points around places and the ways to them, see `ops.knn.neighbours`."""
+        """Rows of the points around positions, and offsets to them, see `ops.knn.neighbours`."""
         positions, cells = self.points.positions, self.points.cells()
         return neighbours(places, positions, cells, self.sizes.neighbours, self.radius)
 
@@ -118,13 +118,13 @@ class PointField(nn.Module):
         direction: Float[Tensor, "q 3"],
         turn: Float[Tensor, "q 3 3"] | None = None,
     ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q h"]]:
-        """Density, and what the feature is made from.
+        """Density, and the hidden layer from which the feature is computed.
 
         Args:
-            rows: Neighbours of each place, -1 where there is none.
-            way: From the place to each.
-            direction: In which the place is looked at; its length matters.
-            turn: Camera-from-world rotation, for ways along the camera's axes.
+            rows: Neighbours of each position, -1 where there is none.
+            way: Offset from the position to each.
+            direction: Viewing direction; not normalised.
+            turn: Camera-from-world rotation, for offsets along the camera's axes.
         """
         taken, place = compact(rows.clamp_min(0))
         own = self.points.take(taken)
@@ -141,14 +141,14 @@ class PointField(nn.Module):
     def feature(
         self, hidden: Float[Tensor, "n h"], direction: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n f"]:
-        """What colour is made from."""
+        """The feature from which colour is computed."""
         encoded = waves(direction, self.sizes.octaves[2]).to(hidden.dtype)
         return self.to_feature(hidden, encoded)
 
     def mean_colour(
         self, rows: Int64[Tensor, "n k"], way: Float[Tensor, "n k 3"]
     ) -> Float[Tensor, "n c"]:
-        """Of the points around places, nearer ones counting more."""
+        """Mean colour of the points around positions, weighted by inverse distance."""
         taken, place = compact(rows.clamp_min(0))
         colours = take_rows(self.points.colours, taken)
         around = colours.index_select(0, place.flatten()).view(*place.shape, colours.shape[-1])
@@ -161,9 +161,9 @@ class PointField(nn.Module):
         way: Float[Tensor, "q k 3"],
         turn: Float[Tensor, "q 3 3"] | None,
     ) -> Float[Tensor, "q k h"]:
-        """The first layer: what a point says is worked out once, however many look at it."""
+        """The first layer: the part of a point is computed once for all positions near it."""
         if self.sizes.axes == "camera":
-            assert turn is not None, "ways along the camera's axes need its rotation"
+            assert turn is not None, "offsets along the camera's axes need its rotation"
             way = torch.cat([way, way @ turn.mT], -1)
         ways = interleaved(way / self.sizes.unit, self.sizes.octaves[1]).to(self.precision)
         parts = [own.descriptors, interleaved(own.descriptors, self.sizes.octaves[0])]
@@ -175,7 +175,7 @@ class PointField(nn.Module):
     def _seen(
         self, own: Attributes, place: Int64[Tensor, "q k"], direction: Float[Tensor, "q 3"]
     ) -> Float[Tensor, "q k s"]:
-        """Colours of points, and how the directions they were first seen from differ from ours."""
+        """Colours of points, and their first viewing directions relative to the present one."""
         known = torch.cat([own.colours, own.directions], -1)
         known = known.index_select(0, place.flatten()).view(*place.shape, known.shape[-1])
         colour, first = known[..., :-3], known[..., -3:]
@@ -193,12 +193,12 @@ class PointField(nn.Module):
 
     @property
     def precision(self) -> torch.dtype:
-        """What the networks compute in."""
+        """Of the computation of the networks."""
         return getattr(torch, self.sizes.precision)
 
 
 class ColourHead(nn.Module):
-    """One layer from a feature to a colour as frames store it.
+    """One layer from a feature to a colour, a stored value.
 
     Args:
         feature: Its width.
@@ -217,8 +217,8 @@ class ColourHead(nn.Module):
         """A little below 0 to a little above 1.
 
         Args:
-            feature: Of each place.
-            start: Colours that the network adds to, in log odds; 0...1.
+            feature: Of each position.
+            start: Colours, 0...1, to whose logits the network's output is added.
         """
         raw = self.layer(feature).float()
         if start is not None:
@@ -227,11 +227,11 @@ class ColourHead(nn.Module):
 
 
 def shares(way: Float[Tensor, "q k 3"], there: Bool[Tensor, "q k"]) -> Float[Tensor, "q k"]:
-    """How much each neighbour counts: inversely to its distance, one in sum where there is any."""
+    """Weights of neighbours: inverse distances, which sum to one where there is any neighbour."""
     near = there / way.norm(dim=-1).clamp_min(NEAREST)
     return near / near.sum(-1, keepdim=True).clamp_min(1e-8)
 
 
 def averaged(values: Float[Tensor, "q k h"], share: Float[Tensor, "q k"]) -> Float[Tensor, "q h"]:
-    """Sum over neighbours by share."""
+    """Weighted sum over neighbours."""
     return (share[:, None].to(values.dtype) @ values)[:, 0]

@@ -1,13 +1,11 @@
-"""Camera paths: six seeded sums of sines, three for where the camera is, three for its tilt.
+"""Camera paths, and the true motion blur of the frames along them.
 
-The camera looks along +z, moves mostly sideways so that near things pass before far ones, and never
-rests, so that every exposure blurs.
+A path is six seeded sums of sines, three for the position of the camera, three for its rotation.
+The camera looks along +z, moves mostly sideways so that there is parallax, and never stops, so that
+every exposure is blurred.
 
-How far things move over the image while the shutter is open: the true blur of a frame.
-
-*Travel* is the length of the way over the image, in px, of the point that a pixel sees in the
-middle of an exposure, from its opening to its closing; the blur of a frame is the mean over its
-pixels.
+*Travel* is the length of the path over the image, in px, of the point at a pixel in the middle of
+an exposure, from its opening to its closing; the blur of a frame is the mean over its pixels.
 """
 
 from collections.abc import Callable
@@ -27,12 +25,12 @@ from sharpfield.geometry import se3
 from sharpfield.geometry.trajectory import Stamped
 
 STAMP_US = 5000
-"""Time between the poses that a capture keeps; a cubic through them is off by less than 1e-4."""
+"""Time between the poses of a capture; the error of a cubic through them is below 1e-4."""
 
 
 @runtime_checkable
 class CameraPath(Protocol):
-    """Where a camera is at any time."""
+    """The pose of a camera at any time."""
 
     def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
         """World-from-camera, OpenCV axes."""
@@ -51,12 +49,12 @@ class Motion:
     def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
         """World-from-camera, OpenCV axes."""
         turn = 2e-6 * np.pi * t_us[:, None] * self.frequency_hz  # [n, k]
-        place = (self.amplitude * np.sin(turn[..., None] + self.phase)).sum(1)  # [n, 6]
-        rotation = se3.rotation_exp(torch.from_numpy(place[:, 3:])).numpy()
-        return np.concatenate([rotation, place[:, :3, None]], -1)
+        state = (self.amplitude * np.sin(turn[..., None] + self.phase)).sum(1)  # [n, 6]
+        rotation = se3.rotation_exp(torch.from_numpy(state[:, 3:])).numpy()
+        return np.concatenate([rotation, state[:, :3, None]], -1)
 
     def faster(self, factor: float) -> "Motion":
-        """The same path, run through `factor` times as fast."""
+        """The same path, `factor` times as fast."""
         return replace(self, frequency_hz=factor * self.frequency_hz)
 
 
@@ -80,7 +78,7 @@ def stamped(path: CameraPath, clock: Clock) -> Stamped:
 
 
 def _glide(seed: int) -> Motion:
-    """An uneven loop of 0.8 s, as of an arm that swings a camera."""
+    """An irregular loop of 0.8 s, as of a camera swung by an arm."""
     draw = numpy_generator(seed, 0, "motion")
     size = draw.uniform(0.9, 1.1, 6)
     start, turn = draw.uniform(0, 2 * np.pi), draw.choice([-1, 1])
@@ -95,7 +93,7 @@ def _glide(seed: int) -> Motion:
 
 
 def _shaky(seed: int) -> Motion:
-    """The same loop, smaller, held by an unsteady hand."""
+    """The same loop, smaller, with hand tremor."""
     base, draw = _glide(seed), numpy_generator(seed, 0, "shake")
     frequency = draw.uniform([4.0, 6.5, 9.0], [5.5, 8.0, 11.0])
     tremor = np.array([0.02, 0.02, 0.01, 0.009, 0.009, 0.009])
@@ -112,26 +110,26 @@ MOTIONS: dict[str, Callable[[int], Motion]] = {"glide": _glide, "shaky": _shaky}
 
 
 WAYPOINTS = 9
-"""Instants of an exposure at which the points are looked at."""
+"""Instants of an exposure at which points are projected."""
 LEAST_DEPTH = 0.05
 """Points nearer than this, or behind the camera, are left out."""
 ROUNDS = 6
-"""Corrections of an exposure; travel grows almost evenly with it, so three are enough."""
+"""Iterations of `exposure_for`; travel is almost linear in the exposure, so three are enough."""
 
 
 def travel(
     camera: Camera, path: CameraPath, depth: Float32[np.ndarray, "h w"], window_us: tuple[int, int]
 ) -> Float64[np.ndarray, "q"]:
-    """Lengths of the ways, in px of this camera, of the points that its pixels see.
+    """Travel of the points at all pixels, in px of this camera.
 
     Args:
         camera: The lens and sensor; one of few pixels is enough for a mean.
-        path: Where the camera is.
+        path: Of the camera.
         depth: In the middle of the window, along the camera's axis.
         window_us: When the shutter opens and closes.
 
     Returns:
-        One length for each pixel whose point stays before the camera.
+        One length for each pixel whose point stays in front of the camera.
     """
     opens, closes = window_us
     times = np.rint(np.linspace(opens, closes, WAYPOINTS)).astype(np.int64)
@@ -140,10 +138,10 @@ def travel(
     inside = (rays / rays[..., 2:] * along).reshape(-1, 3).numpy()
     poses = path.poses(np.append(times, opens + (closes - opens) // 2))
     points = inside @ poses[-1, :, :3].T + poses[-1, :, 3]
-    seen = (points - poses[:-1, None, :, 3]) @ poses[:-1, :, :3]  # [t, q, 3]
-    there = (seen[..., 2] > LEAST_DEPTH).all(0)
-    ways = camera.project(torch.from_numpy(seen[:, there])).numpy()
-    return np.linalg.norm(np.diff(ways, axis=0), axis=-1).sum(0)
+    by_time = (points - poses[:-1, None, :, 3]) @ poses[:-1, :, :3]  # [t, q, 3]
+    visible = (by_time[..., 2] > LEAST_DEPTH).all(0)
+    tracks = camera.project(torch.from_numpy(by_time[:, visible])).numpy()  # [t, q, 2]
+    return np.linalg.norm(np.diff(tracks, axis=0), axis=-1).sum(0)
 
 
 def exposure_for(
@@ -153,26 +151,26 @@ def exposure_for(
     blur_px: float,
     most_us: int,
 ) -> int:
-    """How long to expose, in us, so that a share of the frames is blurred by `blur_px` or more.
+    """Exposure time in us for which a fraction of the frames is blurred by `blur_px` or more.
 
     Args:
-        travels: Mean travel of each frame for an exposure of so many us.
-        blurry: Share of frames to blur, 0...1.
-        blur_px: From which travel on a frame is blurry.
-        most_us: Longest exposure there is time for.
+        travels: Mean travel of each frame, given the exposure in us.
+        blurry: Fraction of frames to blur, 0...1.
+        blur_px: Travel from which a frame counts as blurry.
+        most_us: Longest possible exposure.
     """
     exposure_us = most_us
     for _ in range(ROUNDS):
         each = np.sort(travels(exposure_us))
         wanted = round(blurry * len(each))
-        # With none to be blurred, the fastest stays just below.
+        # With none to blur, the fastest frame stays just below the limit.
         edge = each[len(each) - max(wanted, 1)] * (1.02 if wanted == 0 else 1.0)
         exposure_us = int(min(exposure_us * blur_px / max(edge, 1e-9) + 1, most_us))
     return exposure_us
 
 
 def instants(exposure: Exposure, frame: int, *, images: int) -> Int64[np.ndarray, "k"]:
-    """Times at which to draw one exposure: both ends, the middle, and evenly between."""
+    """Times at which to render one exposure: both ends, the middle, and evenly in between."""
     opens, closes = exposure.window(frame)
     even = np.rint(np.linspace(opens, closes, images)).astype(np.int64)
     return np.unique(np.append(even, exposure.middle_us[frame]))

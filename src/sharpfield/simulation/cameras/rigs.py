@@ -1,7 +1,8 @@
-"""Where the cameras of a rig are: on a ring around the scene, or carried in a hand.
+"""Camera rigs: a ring of static cameras around the scene, or one hand-held camera.
 
-The ring is that of EvDNeRF's simulated data: cameras 4 away and 30 degrees above the table look at
-the origin, in a world whose z axis points up. Those held out stand half a step between the others.
+The ring is that of EvDNeRF's simulated data: cameras at a distance of 4 and an elevation of 30
+degrees look at the origin, in a world whose z axis points up. Held-out cameras are half a step
+between the others.
 
 Source: Bhattacharya et al., *EvDNeRF* (WACV 2024), its poses as published.
 """
@@ -27,7 +28,7 @@ RING_FOCAL = 50 / 36
 
 @dataclass(frozen=True)
 class StillCamera:
-    """A camera that stands still."""
+    """A static camera."""
 
     pose: Float64[np.ndarray, "3 4"]
 
@@ -38,13 +39,13 @@ class StillCamera:
 
 @dataclass(frozen=True)
 class CarriedCamera:
-    """A camera that moves about a place, as told by a path of small movements."""
+    """A camera that moves around a base pose along a path of small movements."""
 
     base: Float64[np.ndarray, "3 4"]
     path: Motion
 
     def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
-        """World-from-camera: the movement, in the axes of the place."""
+        """World-from-camera: the movement in the axes of the base pose."""
         base, moved = torch.from_numpy(self.base), torch.from_numpy(self.path.poses(t_us))
         return se3.compose(base.expand_as(moved), moved).numpy()
 
@@ -78,7 +79,7 @@ def ring_pose(
 
 
 def ring(views: int, *, held_out: int = 0) -> Views:
-    """Cameras evenly spaced on the ring, and others to be held out, half a step beside some.
+    """Cameras evenly spaced on the ring, and held-out ones half a step between them.
 
     Raises:
         OptionError: There are fewer than one, or more held out than others.
@@ -97,12 +98,12 @@ def ring(views: int, *, held_out: int = 0) -> Views:
 
 
 def hand_held(name: str = "glide", *, seed: int = 0, held_out: int = 0) -> Views:
-    """One camera carried before the scene; others stand on the ring near it, to be held out.
+    """One hand-held camera in front of the scene, and held-out static ones on the ring near it.
 
     Args:
         name: A path, one of `MOTIONS`.
         seed: Of the path.
-        held_out: How many, within 20 degrees to both sides.
+        held_out: Their number, within 20 degrees to both sides.
     """
     aside = np.linspace(-20, 20, held_out) if held_out > 1 else np.zeros(held_out)
     return Views(

@@ -1,8 +1,8 @@
-"""A walk through the room: once around the table in 20 s, looking about, with pauses.
+"""A walk through the room: once around the table in 20 s, looking around, with pauses.
 
-How far the camera has come is the integral of a speed that is drawn in stretches of half a second:
-now it stands, now it hurries. A hand shakes it, the less the slower it goes. All of it is smooth,
-and drawn from a seed.
+The position along the loop is the integral of a speed that is drawn for segments of half a second,
+from standstill to fast. Hand tremor is added, weaker at lower speed. All of it is smooth, and
+depends on a seed.
 """
 
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ LOOP_S = 20.0
 STRETCH_S = 0.5
 """Time from one drawn speed to the next."""
 TICK_US = 1000
-"""Spacing of the table of distances."""
+"""Time step of the table of positions along the loop."""
 CALM = 0.12
-"""Least share of the mean speed, and of the hand's shaking."""
+"""Speed in pauses, as a fraction of the mean speed."""
 PAUSES = 0.2
-"""Share of stretches in which the camera stands."""
+"""Fraction of segments that are pauses."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class RoomWalk:
     """A camera path through the room, see `walk`."""
 
     phase: Float64[np.ndarray, "m"]
-    """How far the camera has come, in turns around the table, every `TICK_US`."""
+    """Position along the loop, in turns around the table, every `TICK_US`."""
     pace: Float64[np.ndarray, "m"]
-    """Its speed at the same times, as a share of the mean."""
+    """Speed at the same times, as a fraction of the mean."""
     bend: Float64[np.ndarray, "6"]
-    """Phases of the looking about."""
+    """Phases of the slow variations of position and viewing direction."""
     tremor_hz: Float64[np.ndarray, "k"]
     tremor: Float64[np.ndarray, "k 6"]
     """Metres for x, y, z; rad for the turns about them."""
@@ -47,34 +47,34 @@ class RoomWalk:
         ticks = np.arange(len(self.phase))
         turns = 2 * np.pi * np.interp(at, ticks, self.phase)
         pace = np.interp(at, ticks, self.pace)
-        shake = 2e-6 * np.pi * t_us[:, None] * self.tremor_hz
-        shake = (self.tremor * np.sin(shake[..., None] + self.tremor_phase)).sum(1)
-        shake = shake * (0.15 + 0.85 * np.minimum(pace, 1.5))[:, None]
-        place = self._place(turns) + shake[:, :3]
-        yaw, pitch, roll = self._look(turns, place)
-        turn = [pitch + shake[:, 3], yaw + shake[:, 4], roll + shake[:, 5]]
+        angle = 2e-6 * np.pi * t_us[:, None] * self.tremor_hz
+        tremor = (self.tremor * np.sin(angle[..., None] + self.tremor_phase)).sum(1)  # [n, 6]
+        tremor = tremor * (0.15 + 0.85 * np.minimum(pace, 1.5))[:, None]
+        position = self._position(turns) + tremor[:, :3]
+        yaw, pitch, roll = self._angles(turns, position)
+        turn = [pitch + tremor[:, 3], yaw + tremor[:, 4], roll + tremor[:, 5]]
         rotation = [se3.rotation_exp(torch.from_numpy(_about(k, turn[k]))) for k in (1, 0, 2)]
         rotation = (rotation[0] @ rotation[1] @ rotation[2]).numpy()
-        return np.concatenate([rotation, place[:, :, None]], -1)
+        return np.concatenate([rotation, position[:, :, None]], -1)
 
-    def _place(self, turns: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
-        """Around the table, a little nearer and farther, up and down."""
+    def _position(self, turns: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Around the table, with varying distance and height."""
         reach = 1 + 0.08 * np.sin(3 * turns + self.bend[0])
         height = 0.12 * np.sin(2 * turns + self.bend[1]) - 0.05
         return np.stack([1.35 * reach * np.cos(turns), height, 1.0 * reach * np.sin(turns)], -1)
 
-    def _look(
-        self, turns: Float64[np.ndarray, "n"], place: Float64[np.ndarray, "n 3"]
+    def _angles(
+        self, turns: Float64[np.ndarray, "n"], position: Float64[np.ndarray, "n 3"]
     ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-        """Yaw towards the other side of the room and to either side of it; pitch; roll."""
-        across = np.unwrap(np.arctan2(-place[:, 0], -place[:, 2]))
+        """Yaw towards the opposite side of the room, and around that; pitch; roll."""
+        across = np.unwrap(np.arctan2(-position[:, 0], -position[:, 2]))
         aside = 0.55 * np.sin(4 * turns + self.bend[2]) + 0.2 * np.sin(9 * turns + self.bend[3])
         pitch = -0.17 + 0.16 * np.sin(5 * turns + self.bend[4])
         return across + aside, pitch, 0.04 * np.sin(3 * turns + self.bend[5])
 
 
 def walk(duration_us: int, seed: int) -> RoomWalk:
-    """A walk of a given length in time, drawn from a seed; a longer one begins like a shorter."""
+    """A walk of a given duration, from a seed; a longer one begins like a shorter one."""
     draw = numpy_generator(seed, 0, "walk")
     bend = draw.uniform(0, 2 * np.pi, 6)
     start = draw.uniform()
@@ -96,10 +96,10 @@ def walk(duration_us: int, seed: int) -> RoomWalk:
 def _smoothly(
     at: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "s"]
 ) -> Float64[np.ndarray, "m"]:
-    """Between values at 0, 1, 2, ... without corners."""
+    """Smooth (smoothstep) interpolation of values at 0, 1, 2, ..."""
     left = np.minimum(at.astype(np.int64), len(values) - 2)
-    share = at - left
-    ease = share * share * (3 - 2 * share)
+    fraction = at - left
+    ease = fraction * fraction * (3 - 2 * fraction)
     return values[left] * (1 - ease) + values[left + 1] * ease
 
 

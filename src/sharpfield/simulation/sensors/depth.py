@@ -1,8 +1,8 @@
-"""What real depth cameras make of a true depth map: noise, holes, and poses that drift.
+"""Errors of real depth cameras: noise, holes, and poses that drift.
 
-Noise grows with the square of depth, as that of every camera that triangulates. There are *holes*,
-where nothing was measured, on surfaces seen at a grazing angle, beside edges of depth (only one of
-the two eyes sees there), and farther than the sensor reaches. Poses found by a SLAM system *drift*
+Noise grows with the square of depth, as for every camera that triangulates. There are *holes*,
+where nothing is measured, on surfaces at a grazing angle, beside depth edges (which are visible to
+only one of the two cameras), and beyond the range of the sensor. Poses of a SLAM system *drift*
 slowly away from the true path.
 
 Source: Khoshelham and Elberink, "Accuracy and resolution of Kinect depth data" (Sensors 2012), for
@@ -25,13 +25,13 @@ from sharpfield.geometry import se3
 from sharpfield.simulation.cameras.motions import CameraPath, Motion
 
 BLOTCH_PX = 3
-"""Noise of neighbours is alike: it is averaged over so many pixels a side."""
+"""Noise of neighbours is correlated: it is averaged over so many pixels a side."""
 EDGE = 0.05
-"""Depth that changes by more than this share from pixel to pixel is an edge."""
+"""A larger relative change of depth from pixel to pixel is an edge."""
 DRIFT_HZ = (0.013, 0.031, 0.072)
-"""Of the slow waves that drift is made of."""
+"""Frequencies of the drift."""
 ARM_M = 3.0
-"""A turn of the world moves what is so far from its middle as much as its shift does."""
+"""Distance from the origin at which the rotation of the drift moves points as its translation."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class DepthSensor:
     def measure(
         self, depth: Float32[np.ndarray, "h w"], camera: Camera, draw: np.random.Generator
     ) -> Float[np.ndarray, "h w"]:
-        """A map as this sensor would have measured it; 0 where it could not.
+        """The depth map that this sensor measures; 0 where it cannot.
 
         Args:
             depth: The truth, along the axis.
-            camera: That sees it.
-            draw: What chance is drawn from.
+            camera: Of the depth map.
+            draw: Random generator of the noise.
         """
         if self.noise == 0:
             return depth
@@ -68,7 +68,7 @@ class DepthSensor:
         return np.where(seen, (exact + self.noise * exact**2 * blotchy).clip(0), 0)
 
     def seen(self, depth: Float32[np.ndarray, "h w"], camera: Camera) -> Bool[np.ndarray, "h w"]:
-        """Where the sensor measures at all."""
+        """Pixels at which the sensor measures."""
         near = np.isfinite(depth) & (depth < self.farthest)
         exact = np.where(np.isfinite(depth), depth, 0).astype(np.float64)
         rays = DepthMaps(np.zeros((1, *depth.shape), np.uint16), camera).rays()
@@ -82,24 +82,24 @@ class DepthSensor:
 
 @dataclass(frozen=True)
 class Drifting:
-    """A path as a SLAM system would have told it."""
+    """A path as estimated by a SLAM system."""
 
     path: CameraPath
     drift: Motion
     """Of the world."""
 
     def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
-        """World-from-camera, a little off."""
+        """World-from-camera, with drift."""
         drift, path = (torch.from_numpy(one.poses(t_us)) for one in (self.drift, self.path))
         return se3.compose(drift, path).numpy()
 
 
 def drifting(path: CameraPath, most: float, seed: int) -> CameraPath:
-    """A path that drifts by up to about so many metres.
+    """A path that drifts by up to about `most` metres.
 
     Args:
         path: The true one.
-        most: In metres; 0 gives the path itself.
+        most: 0 gives the path itself.
         seed: Of the drift.
     """
     if most == 0:

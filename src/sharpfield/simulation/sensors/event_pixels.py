@@ -1,7 +1,7 @@
-"""What an event camera's pixels are like: thresholds, dead time, noise, bandwidth, colour.
+"""The model of event camera pixels: thresholds, refractory period, noise, bandwidth, colour.
 
-A pixel watches the logarithm of its light and reports each time it has changed by a threshold
-since the last report. Real pixels differ in all that `EventSensor` lists.
+A pixel makes an event each time the logarithm of its light has changed by a threshold since its
+last event. `EventSensor` lists the ways in which real pixels depart from that.
 
 Source: ESIM (Rebecq et al., CoRL 2018) for the ideal pixel; v2e (Hu et al., CVPRW 2021) for leak,
 shot noise and bandwidth; Robust e-NeRF (Low and Lee, ICCV 2023) for the reset at the end of the
@@ -21,18 +21,18 @@ from sharpfield.core.seed import numpy_generator
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """Rec.601 weights, applied to linear RGB."""
 LEAST_THRESHOLD = 0.01
-"""No pixel is more sensitive than this, in natural log."""
+"""Smallest threshold of a pixel, in natural log."""
 LIN_LOG_KNEE = 20 / 255
-"""Below this intensity the lin-log curve is straight."""
+"""Below this intensity the lin-log curve is linear."""
 BRIGHT_SHOT = 0.25
-"""Shot noise of a fully lit pixel, as a share of that in the dark (v2e)."""
+"""Shot noise of a fully lit pixel, as a fraction of that in the dark (v2e)."""
 DARK_SPEED = 0.1
-"""Bandwidth in the dark, as a share of that in full light (v2e)."""
+"""Bandwidth in the dark, as a fraction of that in full light (v2e)."""
 
 
 @dataclass(frozen=True)
 class EventSensor:
-    """The numbers of an event camera; the defaults are an ideal one."""
+    """Parameters of an event camera; the defaults are an ideal one."""
 
     threshold_on: float = 0.2
     """Mean contrast threshold of ON events, natural log."""
@@ -41,30 +41,30 @@ class EventSensor:
     threshold_sigma: float = 0.0
     """Standard deviation of the thresholds over the pixels, natural log."""
     refractory_us: float = 0.0
-    """Dead time after an event."""
+    """Refractory period after an event."""
     refractory_rule: Literal["drop", "reset"] = "drop"
-    """In the dead time, crossings are dropped and the reference moves; or the pixel is held, and
-    its reference is reset to the present light at the end."""
+    """In the refractory period, crossings are dropped but move the reference level; or the pixel is
+    held in reset, and the reference is the light at its end."""
     leak_hz: float = 0.0
     """ON events per second without any change of light, from leaking junctions."""
     leak_jitter: float = 0.0
-    """Standard deviation of leak intervals, as a share of their mean."""
+    """Standard deviation of leak intervals, as a fraction of their mean."""
     shot_hz: float = 0.0
     """Noise events per second and pixel in the dark; they fall off with light."""
     hot_share: float = 0.0
-    """Share of pixels that are hot."""
+    """Fraction of pixels that are hot."""
     hot_hz: float = 100.0
     """ON events per second of a hot pixel."""
     cutoff_hz: float = 0.0
-    """Bandwidth of a fully lit pixel, a first-order low-pass on the log; slower in the dark.
-    0 for a pixel that follows at once."""
+    """Bandwidth of a fully lit pixel, a first-order low-pass on the log; lower in the dark. 0 for
+    unlimited bandwidth."""
     bayer: str = ""
-    """Colour filter tile, e.g. "RGGB"; "" for a grey sensor, which sees Rec.601 luma."""
+    """Colour filter tile, e.g. "RGGB"; "" for a mono sensor, which measures Rec.601 luma."""
     curve: Literal["log", "lin-log"] = "log"
     floor: float = 1e-5
     """Added to linear intensity before the logarithm."""
     start: Literal["light", "random"] = "light"
-    """Reference at the first instant: the light itself, or anywhere between the thresholds."""
+    """Reference level at the first instant: the light itself, or random between the thresholds."""
 
     def __post_init__(self) -> None:
         if not (self.threshold_on > 0 and self.threshold_off > 0):
@@ -145,24 +145,24 @@ SIZES = {"dvs346": (346, 260), "gen3-vga": (640, 480), "gen4-hd": (1280, 720)}
 
 
 class Pixels(NamedTuple):
-    """What is fixed in each pixel, and what it remembers; the memory is written by the kernel."""
+    """Parameters and state of each pixel; the state is updated by the kernel."""
 
     on: Float64[np.ndarray, "n"]
     off: Float64[np.ndarray, "n"]
     leak: Float64[np.ndarray, "n"]
     """Log units per ns."""
     reference: Float64[np.ndarray, "n"]
-    """The level that the present one is compared with."""
+    """Reference level: log light at the last event."""
     ready_ns: Int64[np.ndarray, "n"]
-    """End of the dead time; before all time if there is none."""
+    """End of the refractory period; the smallest integer if there is none."""
     hazard: Float64[np.ndarray, "n"]
-    """What is left of an exponential variable; a noise event falls where it runs out."""
+    """Rest of an exponential variable; a noise event occurs when it reaches zero."""
     random: UInt64[np.ndarray, "n"]
     """State of each pixel's own generator."""
 
 
 def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int) -> Pixels:
-    """Draw a sensor's pixels, looking at light of a first log `level`."""
+    """Random pixels of a sensor, whose first log light is `level`."""
     n = len(level)
     draw = numpy_generator(seed, 0, "event pixels")
     spread = sensor.threshold_sigma * draw.standard_normal((2, n))
@@ -170,10 +170,10 @@ def make_pixels(sensor: EventSensor, level: Float64[np.ndarray, "n"], seed: int)
     off = np.maximum(sensor.threshold_off + spread[1], LEAST_THRESHOLD)
     hot = draw.random(n) < sensor.hot_share
     leak = on * 1e-9 * (sensor.leak_hz + hot * sensor.hot_hz)
-    place = draw.random(n)
+    fraction = draw.random(n)
     reference = level.copy()
     if sensor.start == "random":
-        reference += off - place * (on + off)
+        reference += off - fraction * (on + off)
     return Pixels(
         on=on,
         off=off,
@@ -203,7 +203,7 @@ def brightness(
 def log_intensity(
     light: Float32[np.ndarray, "h w"], sensor: EventSensor
 ) -> Float64[np.ndarray, "n"]:
-    """What a photoreceptor puts out: the logarithm, or lin-log, which is straight in the dark."""
+    """Output of the photoreceptor: the logarithm, or lin-log, which is linear in the dark."""
     value = light.reshape(-1).astype(np.float64) + sensor.floor
     if sensor.curve == "log":
         return np.log(value)

@@ -1,8 +1,9 @@
-"""Events from images: exact crossing times, linear in log intensity between two instants.
+"""Events from images: exact crossing times, for log intensity that is linear between two images.
 
-Times are integer ns inside and us in the stream, rounded to the nearest. Images are fed one
-after the other, so a recording of any length needs the memory of one gap between two of them.
-The result does not depend on how a straight piece of log intensity is cut into gaps.
+`events_of` takes a sequence of images; `EventPixels` is fed one image after the other, so that a
+recording of any length needs the memory of one *gap*, the time between two images. Times are
+integer ns inside and us in the stream, rounded to the nearest. The result does not depend on how a
+linear piece of log intensity is divided into gaps.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -51,7 +52,7 @@ class Gap(NamedTuple):
 
 
 class EventPixels:
-    """The pixels of one event camera, which remember what they saw."""
+    """The pixels of one event camera, with their state."""
 
     def __init__(self, sensor: EventSensor, seed: int) -> None:
         self.sensor, self.seed = sensor, seed
@@ -102,8 +103,8 @@ class EventPixels:
         return _ordered(self._spikes, count, span_ns, self._size[1])
 
     def thresholds(self) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"]]:
-        """Contrast thresholds of each pixel, ON and OFF; known once a image was seen."""
-        assert self.pixels is not None, "thresholds are drawn when the first image is seen"
+        """Contrast thresholds of each pixel, ON and OFF; known after the first image."""
+        assert self.pixels is not None, "thresholds are drawn at the first image"
         on, off = self.pixels.on.reshape(self._size), self.pixels.off.reshape(self._size)
         return on.astype(np.float32), off.astype(np.float32)
 
@@ -124,13 +125,13 @@ class EventPixels:
     def _follow(
         self, target: Float64[np.ndarray, "n"], light: Float32[np.ndarray, "h w"], gap_ns: int
     ) -> Float64[np.ndarray, "n"]:
-        """Level after a gap in which the light went straight to a target; exact for a ramp."""
+        """Low-passed level after a gap with log light linear to a target; exact for a ramp."""
         before, self._target = self._target, target
         if not self.sensor.cutoff_hz:
             return target
-        share = DARK_SPEED + (1 - DARK_SPEED) * np.clip(light.reshape(-1), 0, 1).astype(np.float64)
-        gap = 2 * np.pi * self.sensor.cutoff_hz * share * (1e-9 * gap_ns)  # in time constants
-        passed = -np.expm1(-gap)  # share of a step that has got through
+        speed = DARK_SPEED + (1 - DARK_SPEED) * np.clip(light.reshape(-1), 0, 1).astype(np.float64)
+        gap = 2 * np.pi * self.sensor.cutoff_hz * speed * (1e-9 * gap_ns)  # in time constants
+        passed = -np.expm1(-gap)  # step response
         lag = (target - before) / gap * passed
         return target - lag + (self._level - before) * (1 - passed)
 
@@ -143,7 +144,7 @@ def watch(
     shortest_us: int = 250,
     floor: float = 1e-5,
 ) -> Iterator[tuple[int, Float32[np.ndarray, "h w 3"]]]:
-    """Images at some instants, and between them wherever a pixel changes too much in one gap.
+    """Images at some instants, and in between where a pixel changes too much in one gap.
 
     Args:
         render: Linear light at a time in us; must be a pure function.
@@ -212,10 +213,10 @@ def events_of(
 @njit(cache=True)
 @no_type_check
 def _cross(pixels, levels, light, span_ns, rules, spikes):
-    """Let all pixels see a straight piece of log intensity; collect their events.
+    """Advance all pixels over a linear piece of log intensity; collect their events.
 
     Args:
-        pixels: See `Pixels`; their memory is brought up to date.
+        pixels: See `Pixels`; their state is updated.
         levels: Where each level starts and ends.
         light: Linear intensity, which decides on shot noise.
         span_ns: Start and end.
@@ -277,7 +278,7 @@ def _cross(pixels, levels, light, span_ns, rules, spikes):
 @njit(cache=True)
 @no_type_check
 def _next_crossing(above, below, start, finish, span_ns):
-    """When a straight line first leaves the dead zone, and on which side; 0 for never."""
+    """When a line first crosses a threshold, and which; polarity 0 for never."""
     t0, t1 = span_ns
     if finish > start and finish >= above:
         share, p = (above - start) / (finish - start), 1
@@ -291,7 +292,7 @@ def _next_crossing(above, below, start, finish, span_ns):
 @njit(cache=True)
 @no_type_check
 def _longer(column):
-    """The same column with room for as much again."""
+    """The same column with twice the capacity."""
     longer = np.empty(2 * len(column), column.dtype)
     longer[: len(column)] = column
     return longer

@@ -1,4 +1,4 @@
-"""Blurry frames: the mean of linear light while the shutter is open, as a sensor would store it."""
+"""Blurry frames: the mean of linear light over an exposure, with a sensor's noise and encoding."""
 
 from dataclasses import dataclass, replace
 
@@ -20,7 +20,7 @@ class FrameSensor:
     full_well: float = 0.0
     """Electrons at white, which set the photon noise; 0 for no photon noise."""
     read_noise: float = 0.0
-    """Standard deviation of noise that does not depend on light, as a share of white."""
+    """Standard deviation of noise that does not depend on light, as a fraction of white."""
     row_delay_us: float = 0.0
     """Each row opens and closes this much later than the one above: a rolling shutter."""
 
@@ -38,10 +38,10 @@ class FrameSensor:
 
 
 class Exposing:
-    """Light gathered by many exposures from images that are shown one after the other.
+    """Integrates the light of many exposures from a sequence of images.
 
-    Between two images light goes straight, so the mean is exact for light that does; an exposure
-    of no length takes the image at its instant.
+    Light is linear in time between two images, so the mean is exact for such light; an exposure of
+    no length takes the image at its instant.
     """
 
     def __init__(
@@ -66,13 +66,13 @@ class Exposing:
         for i in np.flatnonzero(near):
             a, b = np.maximum(self._open[i], start), np.minimum(self._close[i], t_us)
             instant = self._open[i] == self._close[i]
-            share = np.where(instant, (a == b) & (self._seen[i] == 0), np.maximum(b - a, 0))
-            if not share.any():
+            time = np.where(instant, (a == b) & (self._seen[i] == 0), np.maximum(b - a, 0))  # [h]
+            if not time.any():
                 continue
             u = ((0.5 * (a + b) - start) / max(t_us - start, 1)).clip(0, 1)
-            early, late = (share * (1 - u)).astype(np.float32), (share * u).astype(np.float32)
+            early, late = (time * (1 - u)).astype(np.float32), (time * u).astype(np.float32)
             self._sum[i] += early[:, None, None] * before + late[:, None, None] * rgb
-            self._seen[i] += share
+            self._seen[i] += time
 
     def means(self) -> Float32[np.ndarray, "n h w 3"]:
         """Mean linear light of each exposure.
@@ -121,7 +121,7 @@ def decode(
 def store(
     linear: Float32[np.ndarray, "*n h w c"], sensor: FrameSensor, draw: np.random.Generator
 ) -> UInt8[np.ndarray, "*n h w c"] | UInt16[np.ndarray, "*n h w c"]:
-    """What the sensor stores: noise on the light, response curve, clipping, rounding."""
+    """Stored values of linear light: noise, response curve, clipping, rounding."""
     light = linear
     if sensor.full_well:
         light = (draw.poisson(light * sensor.full_well) / sensor.full_well).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Random motion kernels: what a shaken camera does to a image, if it does the same everywhere.
+"""Random motion blur kernels: camera shake that is the same over the whole image.
 
-A kernel of *size* k is drawn on a canvas of 2k by 2k: a polyline of short steps whose headings
-stray the more, the larger the *intensity* phi; then it is shrunk to k by k. With a small phi the
+A kernel of *size* k is drawn on a canvas of 2k by 2k: a polyline of short steps whose directions
+vary more the larger the *intensity* phi; then it is downscaled to k by k. With a small phi the
 stroke is nearly straight.
 
 Source: the generator named by Hybrid Neural Rendering (CVPR 2023, supplement) for its synthetic
@@ -17,23 +17,23 @@ from jaxtyping import Float32, Float64, UInt8, UInt16
 from sharpfield.core.errors import OptionError
 
 SIZE, INTENSITY, PROBABILITY = (3, 16), (0.0, 0.1), 0.75
-"""What the paper draws from: k and phi, and how many frames are blurred."""
+"""The paper's ranges of k and phi, and fraction of frames that are blurred."""
 SHORTEST = 1e-4
 """Least length of a stroke over the longest: steps are drawn until some are shorter than it."""
 LOBES = 3
-"""Of the Lanczos filter that shrinks the canvas."""
+"""Of the Lanczos filter that downscales the canvas."""
 
 
 @dataclass(frozen=True)
 class KernelRange:
-    """What kernels are drawn from."""
+    """Ranges of random kernels."""
 
     k: tuple[int, int] = SIZE
     """Smallest and largest size, in px; the largest is never drawn."""
     phi: tuple[float, float] = INTENSITY
     """Least and greatest intensity, 0...1."""
     probability: float = PROBABILITY
-    """Share of images that are blurred."""
+    """Fraction of images that are blurred."""
 
     def __post_init__(self) -> None:
         if not 3 <= self.k[0] < self.k[1]:
@@ -54,7 +54,7 @@ PUBLISHED = KernelRange()
 
 @dataclass(frozen=True)
 class DrawnBlur:
-    """One kernel and what it was drawn with."""
+    """One kernel and its parameters."""
 
     k: int
     phi: float
@@ -63,7 +63,7 @@ class DrawnBlur:
 
     @property
     def length_px(self) -> float:
-        """Length of the straight even stroke that is spread as far along its main axis."""
+        """Length of the straight uniform stroke with the same variance along its main axis."""
         rows, columns = np.indices(self.kernel.shape).reshape(2, -1)
         weight = self.kernel.ravel().astype(np.float64)
         spread = np.cov(np.stack([columns, rows]), aweights=weight, ddof=0)
@@ -71,7 +71,7 @@ class DrawnBlur:
 
 
 def drawn_blur(ranges: KernelRange, draw: np.random.Generator) -> DrawnBlur | None:
-    """A kernel for one image, or None for a image that stays sharp."""
+    """A kernel for one image, or None for an image that stays sharp."""
     chance = draw.uniform()
     k, phi = int(draw.integers(*ranges.k)), float(draw.uniform(*ranges.phi))
     if chance >= ranges.probability:
@@ -100,9 +100,9 @@ def blurred(
     image: UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"],
     kernel: Float32[np.ndarray, "k k"],
 ) -> UInt8[np.ndarray, "h w c"] | UInt16[np.ndarray, "h w c"]:
-    """A image of the same size, its stored values convolved with a kernel.
+    """An image of the same size, its stored values convolved with a kernel.
 
-    What lies beyond the border is the border's own colour; published data darken there.
+    The border is replicated; published data darken there.
     """
     turned = cv2.flip(kernel, -1)  # OpenCV correlates
     anchor = (len(kernel) // 2,) * 2
@@ -132,7 +132,7 @@ def _halving(k: int) -> Float64[np.ndarray, "k m"]:
 
 
 def _headings(count: int, phi: float, draw: np.random.Generator) -> Float64[np.ndarray, "s"]:
-    """Directions of the steps, in rad: to one side, now and then to the other."""
+    """Directions of the steps, in rad: to one side, with random changes of side."""
     most = draw.uniform(0, phi * np.pi)
     flips = draw.uniform(size=count) < draw.beta(2, 20)
     headings = np.empty(count)
