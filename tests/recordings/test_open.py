@@ -8,7 +8,6 @@ from sharpfield.core.plugins import PluginWarning
 from sharpfield.recordings.open import (
     FORMATS,
     format_of,
-    open_events,
     open_recording,
 )
 from sharpfield.recordings.recording import ReaderOptions
@@ -75,7 +74,7 @@ def test_samples_without_events(samples):
 def test_the_name_of_a_file_is_not_believed(tmp_path):
     write_events(tmp_path / "events.raw", random_events(50))
     assert format_of(tmp_path / "events.raw") == "hdf5"
-    assert len(open_events(tmp_path / "events.raw").load()) == 50
+    assert len(open_recording(tmp_path / "events.raw").load()) == 50
 
 
 def test_every_format_says_what_it_takes():
@@ -117,7 +116,7 @@ def test_what_does_not_belong_to_the_format(tmp_path):
         open_recording(tmp_path / "e.h5", layout="evt9")
     write_image(tmp_path / "p" / "0.png", np.zeros((HEIGHT, WIDTH, 1), np.uint8))
     with pytest.raises(CaptureError, match="nothing says when"):
-        open_events(tmp_path / "p")
+        open_recording(tmp_path / "p")
 
 
 # Formats of other packages

@@ -63,25 +63,6 @@ def open_recording(
     return known.open(path, options)
 
 
-def open_events(
-    path: Path | str, *, unit: str | None = None, sensor: tuple[int, int] | None = None
-) -> Recording:
-    """Open a recording that holds events; see `open_recording`.
-
-    Args:
-        path: A file or a folder.
-        unit: Unit of the stored times (ns, us, ms, s), where the file does not say.
-        sensor: Sensor resolution, width and height, where the file does not say.
-
-    Raises:
-        CaptureError: See `open_recording`; or the recording holds no events.
-    """
-    opened = open_recording(path, ReaderOptions(unit=unit, size=sensor))
-    if opened.events is None:
-        raise CaptureError("the recording holds no events", where=path, got=opened.layout)
-    return opened
-
-
 def format_named(name: str) -> Format:
     """A format by its name.
 

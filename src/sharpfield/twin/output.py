@@ -16,7 +16,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, merged
 from sharpfield.core.files import replacing
 from sharpfield.core.progress import progress_on
-from sharpfield.recordings.open import open_events
+from sharpfield.recordings.open import open_recording
 from sharpfield.report.event_frames import count_events, writing_frames
 from sharpfield.storage.event_formats import exporting_events
 from sharpfield.storage.images import write_image
@@ -102,7 +102,7 @@ def events_of_file(path: Path, span_us: tuple[int, int], view: int) -> EventStre
         CaptureError: It is not an event file, or has no events in the time span.
     """
     found = []
-    for part in open_events(path).chunks():
+    for part in open_recording(path).chunks():
         if part.t_us[0] > span_us[1]:
             break
         own = part.window(span_us[0], span_us[1] + 1)
