@@ -42,15 +42,14 @@ def test_change_still_works_and_names_the_flags(
 
 
 def test_old_names_of_options_are_accepted_with_a_hint(
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(NeRF, "renamed", {"grid.clear": "volume.clear_before"}, raising=False)
-    options = trained(recorded, tmp_path / "run", "--grid.clear", 0.25)
-    assert options["volume"]["clear_before"] == 0.25
-    assert "--grid.clear is now --volume.clear-before" in capsys.readouterr().err
+    options = trained(recorded, tmp_path / "run", "--grids-faster", 2, "--decay=7")
+    assert options["grid_lr_factor"] == 2 and options["lr_decay_steps"] == 7
+    assert capsys.readouterr().err.splitlines() == [
+        "note: the option --grids-faster is now --grid-lr-factor",
+        "note: the option --decay is now --lr-decay-steps",
+    ]
 
 
 def test_old_names_of_presets_are_accepted_with_a_hint(

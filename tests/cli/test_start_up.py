@@ -50,6 +50,8 @@ def answered(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str]]:
         (("train",), 2, "--out"),
         (("train", "ev-splat", "x"), 2, "--out"),
         (("train", "ev-splat", "x", "--out", "y", "--steps", "many"), 2, "steps"),
+        (("train", "ev-splat", "x", "--out", "y", "--sampling.view", "3"), 2, "--sampling.views"),
+        (("train", "nerf", "x", "--out", "y", "--lrr", "3"), 2, "did you mean --lr?"),
         (("train", "x", "--out", "y", "--minutes", "3"), 2, "unknown recipe"),
         (("blocks", "--out", "x"), 2, "PATH"),
         (("evaluate", "x", "--train-views", "all"), 2, "train-views"),

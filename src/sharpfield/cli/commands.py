@@ -148,6 +148,7 @@ def _call(name: str, words: list[str]) -> None:
     config: tuple[Any, ...] = (tyro.conf.FlagCreatePairsOff,)
     if COMMANDS[name].recipe:
         recipe_options.expect_recipe(words)  # before anything heavy is imported
+        recipe_options.expect_known(load(name), words)
         if not {"-h", "--help"} & set(words) and not any(w.startswith("-") for w in words[:2]):
             # Mistakes that are none of the recipe's are said before it is imported.
             bare = recipe_options.without_recipe_flags(load(name))

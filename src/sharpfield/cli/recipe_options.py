@@ -14,7 +14,7 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from sharpfield.core.errors import Hint, OptionError, did_you_mean
-from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes import RECIPES, names_in_source, recipe_named
 from sharpfield.recipes.settings.options import changed, field_texts, new_name, options_of
 from sharpfield.recipes.settings.presets import presets_of
 
@@ -33,6 +33,28 @@ def expect_recipe(words: Sequence[str]) -> None:
     """
     if words and not words[0].startswith("-") and words[0] not in RECIPES:
         raise OptionError("unknown recipe", got=words[0], do=did_you_mean(words[0], RECIPES))
+
+
+def expect_known(command: Callable[..., None], words: Sequence[str]) -> None:
+    """Refuse options that the named recipe cannot have, before it is imported.
+
+    Raises:
+        OptionError: There is one.
+    """
+    name = recipe_in(words)
+    known = None if name is None else names_in_source(name)
+    if known is None:
+        return
+    options, mentioned = known
+    flags = [word.partition("=")[0] for word in words if word.startswith("--") and word != "--"]
+    taken = _flags_of(_own_parameters(command)) | {"help"}
+    for flag in flags:
+        asked = flag[2:].replace("-", "_").removeprefix("recipe.").removeprefix("no_")
+        parts = asked.split(".")
+        groups = {".".join(parts[: i + 1]) for i in range(len(parts))}
+        if asked not in options | taken and not groups & mentioned:
+            similar = {f"--{one.replace('_', '-')}" for one in options | taken}
+            raise OptionError("unknown option", got=flag, do=did_you_mean(flag, sorted(similar)))
 
 
 def recipe_in(words: Sequence[str]) -> str | None:

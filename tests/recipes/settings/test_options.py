@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 
 from sharpfield.core.errors import Hint, OptionError
-from sharpfield.recipes import RECIPES, recipe_named
+from sharpfield.recipes import RECIPES, names_in_source, recipe_named
 from sharpfield.recipes.settings.options import changed, current_name, options_of, with_options
 from sharpfield.recipes.settings.presets import Presets
 
@@ -72,6 +72,9 @@ def test_every_option_of_every_recipe_has_a_meaning(name: str) -> None:
     for preset, change in recipe.presets.all.items():
         assert (change.__doc__ or "").strip(), preset
         assert options_of(change(recipe)).keys()
+    found = names_in_source(name)
+    assert found is not None and options_of(recipe).keys() <= found[0]
+    assert {*getattr(recipe, "renamed", {})} <= found[1]
     assert set(getattr(recipe, "renamed", {}).values()) <= {
         *options_of(recipe),
         *(one.rpartition(".")[0] for one in options_of(recipe)),
