@@ -117,8 +117,8 @@ def _with_thresholds(capture: Capture, checkup: Checkup) -> Capture:
         )
     if stated is not None or measured.explained <= MIN_CORRELATION:
         return capture
-    measured = Thresholds(measured.negative, measured.positive, "estimated")
-    return replace(capture, known=replace(capture.known, thresholds=measured))
+    thresholds = Thresholds(measured.negative, measured.positive, "estimated")
+    return replace(capture, known=replace(capture.known, thresholds=thresholds))
 
 
 def _possible(checkup: Checkup, check: str, run: Callable[[], object]) -> bool:
