@@ -112,8 +112,9 @@ def test_what_does_not_belong_to_the_format(tmp_path):
     with pytest.raises(OptionError, match="the format hdf5 has no option columns") as caught:
         open_recording(tmp_path / "e.h5", ReaderOptions(columns="xytp"))
     assert "it belongs to" in str(caught.value) and "npy" in str(caught.value)
-    with pytest.raises(OptionError, match="unknown format"):
-        open_recording(tmp_path / "e.h5", layout="evt9")
+    with pytest.raises(OptionError, match="unknown format") as caught:
+        open_recording(tmp_path / "e.h5", layout="aedat5")
+    assert "did you mean aedat" in str(caught.value)
     write_image(tmp_path / "p" / "0.png", np.zeros((HEIGHT, WIDTH, 1), np.uint8))
     with pytest.raises(CaptureError, match="nothing says when"):
         open_recording(tmp_path / "p")

@@ -7,7 +7,7 @@ times, sensor resolution, which of several cameras), the error names the option 
 
 from pathlib import Path
 
-from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
 from sharpfield.core.plugins import Registry
 from sharpfield.recordings.recording import NO_OPTIONS, Format, ReaderOptions, Recording
 
@@ -70,7 +70,7 @@ def format_named(name: str) -> Format:
         OptionError: There is none of this name.
     """
     if name not in FORMATS:
-        raise OptionError("unknown format", got=name, do=f"use one of {', '.join(FORMATS)}")
+        raise OptionError("unknown format", got=name, do=did_you_mean(name, FORMATS))
     return FORMATS[name]
 
 

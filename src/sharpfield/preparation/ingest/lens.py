@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64, Shaped
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Certainty
-from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
 from sharpfield.core.events import EventStream, SiteColour
 from sharpfield.preparation.ingest.options import Optics
 from sharpfield.recordings.lens_files import (
@@ -143,7 +143,9 @@ def colour_filter(recording: Recording, given: str | None) -> str:
         OptionError: It is no known one.
     """
     if given not in (None, "none", *DEMOSAIC):
-        raise OptionError("unknown colour filter", got=given, do=f"use none, {', '.join(DEMOSAIC)}")
+        raise OptionError(
+            "unknown colour filter", got=given, do=did_you_mean(given, ["none", *DEMOSAIC])
+        )
     return recording.bayer if given is None else given.replace("none", "")
 
 

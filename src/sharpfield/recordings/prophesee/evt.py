@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from sharpfield.core.errors import CaptureError, OptionError
+from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
 from sharpfield.recordings.bytes import read_blocks
 from sharpfield.recordings.chunks import CHUNK, RawChunk, ReorderBuffer, merge_chunks, resolve_size
 from sharpfield.recordings.prophesee.evt_decode import (
@@ -228,9 +228,7 @@ def _encoding(header: Header, path: Path, given: str | None) -> str:
     """Which of `ENCODINGS` a file uses."""
     if given is not None:
         if given not in ENCODINGS:
-            raise OptionError(
-                "unknown encoding", got=given, do=f"use one of {', '.join(ENCODINGS)}"
-            )
+            raise OptionError("unknown encoding", got=given, do=did_you_mean(given, ENCODINGS))
         return given
     name, version = header.format[""], header.fields.get("evt", "")
     if not name and not version:
