@@ -32,9 +32,11 @@ class Checker(HTMLParser):
         self.ids: list[str] = []
         self.images: list[dict[str, str | None]] = []
         self.text = ""
+        self.scripts = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
+        self.scripts += tag == "script"
         self.references += [v or "" for k, v in attrs if k in ("src", "href", "xlink:href")]
         self.ids += [values["id"] or ""] if "id" in values else []
         if tag == "img":
@@ -165,3 +167,21 @@ def test_nested_settings_get_dotted_names():
         "b.d.e": None,
         "b.f": "none",
     }
+
+
+def test_hostile_names_stay_text_in_the_report_of_a_run(tmp_path: Path):
+    hostile = "\"'><script>alert(1)</script>"
+    one = capture()
+    frames = replace(one.needed_frames, names=tuple(f"{hostile}{i}" for i in range(6)))
+    named = replace(one, name=hostile, source=hostile, frames=frames)
+    metrics = evaluate(
+        Sky(named), named, tmp_path, baselines={hostile: {"mean": {"psnr": 20.0, "ssim": 0.5}}}
+    )
+    paper = Paper(hostile, hostile, hostile, (hostile,))
+    about = RunDescription(hostile, paper, {hostile: hostile})
+    told = checked(write_report(tmp_path, named, metrics, about))
+    assert told.scripts == 1, "only our own"
+    assert told.text.count(hostile) > 20
+    # the table of methods, the title and the heading, and the settings
+    for text in (f"{hostile}20.00", f"{hostile}{hostile}"):
+        assert text in told.text
