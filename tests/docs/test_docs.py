@@ -51,7 +51,8 @@ TOLD = ("runs/",)
 """Folders of examples, where a page names files that commands write."""
 OTHERS = {"pip", "pytest", "venv"}
 """Modules of other packages that pages run."""
-NOUNS = {"capture"}
+FIELDS = {"frames.blur_px"}
+"""Names after a dot that belong to the data of a capture."""
 
 Call = tuple[str, dict[str, Any]]
 
@@ -291,15 +292,14 @@ def test_quoted_folders_exist(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_quoted_names_exist(page: Path) -> None:
-    """`sf.events.edi`, `geometry.se3.exp`, and options of recipes such as `volume.kind=mlp`."""
+    """`sf.events.edi`, `geometry.se3.exp`, and options of recipes: `sampling.views`."""
     groups = {option.split(".")[0] for option in recipe_options() if "." in option}
     for span in spans(page):
-        match = DOTTED.match(span.partition("=")[0])
-        if match is None or Path(match[0]).suffix in FILES or "/" in span:
+        match = DOTTED.match(span)
+        if match is None or Path(match[0]).suffix in FILES or "/" in span or match[0] in FIELDS:
             continue
-        if match[1] == "sf" or match[1] in ROOMS or match[1] in groups and "=" in span:
-            known = match[0] in recipe_options() or resolves(match[0])
-            assert known or match[1] in NOUNS, f"{name(page)}: {span}"
+        if match[1] in {"sf", *ROOMS, *groups}:
+            assert match[0] in recipe_options() or resolves(match[0]), f"{name(page)}: {span}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -316,7 +316,7 @@ def test_quoted_programs_exist(page: Path) -> None:
 
 
 def test_files_and_names_that_are_missing_are_noticed(tmp_path: Path) -> None:
-    assert "mix_of_few" in defined(SOURCE / "formation" / "mixing.py")
+    assert "mix_with_few_gradients" in defined(SOURCE / "formation" / "mixing.py")
     assert "Capture.depth" in defined(SOURCE / "core" / "capture.py")
     assert not resolves("events.nothing.there") and resolves("events.counts")
     assert "sampling.views" in recipe_options() and "sampling.looks" not in recipe_options()
