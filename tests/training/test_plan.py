@@ -16,9 +16,11 @@ def test_the_recipe_gives_the_length_unless_told_otherwise():
 
 def test_minutes_are_filled_with_steps():
     # A step takes 10 ms and a little; 1 s of them, of which the trials take five.
-    steps = affordable_steps(
-        Toy(100, seconds_per_step=0.01), seconds=1.0, schedule=100, micro_batches=1
-    )
+    toy = Toy(100, seconds_per_step=0.01)
+    affordable_steps(
+        toy, seconds=0.0, schedule=100, micro_batches=1
+    )  # what only a first step costs
+    steps = affordable_steps(toy, seconds=1.0, schedule=100, micro_batches=1)
     assert 10 <= steps <= TIME_FRACTION * 95
 
 
@@ -49,12 +51,12 @@ def test_a_small_budget_splits_the_batch():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": 5, "minutes": 1.0}, "--steps and --minutes exclude each other"),
-        ({"steps": 0}, "--steps must be positive\n  got    0"),
-        ({"minutes": -1.0}, "--minutes must be positive\n  got    -1.0"),
-        ({"memory_gb": float("nan")}, "--memory-gb must be positive\n  got    nan"),
-        ({"checkpoint_every": 0}, "--checkpoint-every must be positive"),
-        ({"log_every": 0}, "--log-every must be positive"),
+        ({"steps": 5, "minutes": 1.0}, "`steps` and `minutes` exclude each other"),
+        ({"steps": 0}, "`steps` must be positive\n  got    0"),
+        ({"minutes": -1.0}, "`minutes` must be positive\n  got    -1.0"),
+        ({"memory_gb": float("nan")}, "`memory_gb` must be positive\n  got    nan"),
+        ({"checkpoint_every": 0}, "`checkpoint_every` must be positive"),
+        ({"log_every": 0}, "`log_every` must be positive"),
     ],
 )
 def test_senseless_options_are_refused(options: dict, message: str):

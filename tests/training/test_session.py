@@ -147,7 +147,7 @@ def test_time_that_is_up_stops_politely(tmp_path: Path, straight: Path):
     assert (stopped.steps, stopped.planned_steps) == (10, 30)
     assert output.getvalue().splitlines()[-1] == (
         "Stopped after step 10 of 30: the time is up."
-        " Saved; the same command with --resume goes on from here."
+        " Saved; to go on from here, train again with --resume (resume=True)."
     )
     assert run_toy(tmp_path, TrainingOptions(resume=True)).finished
     assert (
@@ -192,7 +192,7 @@ def test_a_folder_that_holds_a_run_is_refused(straight: Path):
     assert str(error.value).splitlines() == [
         "RunError: the folder already holds a run",
         f"  where  {straight}",
-        "  do     go on with it by --resume, or name another folder",
+        "  do     go on with it by --resume (resume=True), or name another folder",
     ]
 
 

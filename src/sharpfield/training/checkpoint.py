@@ -37,7 +37,7 @@ Settings = dict[str, Any]
 
 HEADER = "sharpfield"
 SUFFIX = ".safetensors"
-START_AGAIN = "train again without --resume, into another folder"
+START_AGAIN = "train again, into another folder"
 
 
 @dataclass(frozen=True)

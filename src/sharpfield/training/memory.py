@@ -87,7 +87,7 @@ def plan_micro_batches(model: Model, *, budget_bytes: int) -> int:
         raise OptionError(
             "one training step does not fit in the memory budget, however it is split",
             got=f"a budget of {budget_bytes / GIB:.2f} GiB, at least {needed / GIB:.2f} GiB needed",
-            do="raise --memory-gb, or choose a smaller preset",
+            do="raise `memory_gb` (--memory-gb), or choose a smaller preset",
         )
     return _even(max(smallest, 1), lengths)
 

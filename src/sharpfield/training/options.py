@@ -26,7 +26,7 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         if self.steps is not None and self.minutes is not None:
-            raise OptionError("--steps and --minutes exclude each other", do="give one of them")
+            raise OptionError("`steps` and `minutes` exclude each other", do="give one of them")
         for name, value in vars(self).items():
             if isinstance(value, int | float) and name != "resume" and not value > 0:
-                raise OptionError(f"--{name.replace('_', '-')} must be positive", got=value)
+                raise OptionError(f"`{name}` must be positive", got=value)

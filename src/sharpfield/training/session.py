@@ -146,7 +146,7 @@ def train(
     if not checkpointer.status.finished:
         console.print(
             f"Stopped after step {checkpointer.status.steps} of {plan.steps}: {stop.reason}."
-            " Saved; the same command with --resume goes on from here.",
+            " Saved; to go on from here, train again with --resume (resume=True).",
             highlight=False,
             soft_wrap=True,
         )
@@ -165,7 +165,7 @@ def require_unused(run: Path) -> None:
         raise RunError(
             "the folder already holds a run",
             where=run,
-            do="go on with it by --resume, or name another folder",
+            do="go on with it by --resume (resume=True), or name another folder",
         )
 
 
