@@ -157,7 +157,8 @@ def test_times_rounded_by_two_microseconds_are_covered(early: int):
             {"split": Split(np.array([0, 1]), np.array([3]))},
             "CaptureError: the split names frames that do not exist\n"
             "  where  garden\n"
-            "  got    indices 0 to 3 of 3 frames",
+            "  got    indices 0 to 3 of 3 frames\n"
+            "  do     use indices from 0 to the number of frames - 1",
         ),
         (
             {"trajectory": Rail(1_050_000, 1_500_000)},

@@ -154,6 +154,7 @@ class Capture:
                 "there must be one depth map for each frame",
                 where=self.name,
                 got=f"{len(self.depth)} maps, {len(self.frames or ())} frames",
+                do="give a map for each frame, 0 where unknown",
             )
 
     def __repr__(self) -> str:
@@ -241,6 +242,7 @@ class Capture:
                 "the split names frames that do not exist",
                 where=self.name,
                 got=f"indices {used.min()} to {used.max()} of {len(frames)} frames",
+                do="use indices from 0 to the number of frames - 1",
             )
 
     def _expect_covered_exposures(self, frames: Frames) -> None:

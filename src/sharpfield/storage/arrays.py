@@ -103,7 +103,7 @@ def _load(path: Path) -> "Array | np.lib.npyio.NpzFile":
     try:
         return np.load(path, allow_pickle=False)
     except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
+        raise CaptureError("file not found", where=path, do="check the path") from None
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise _unreadable(path, error) from None
 
@@ -140,7 +140,7 @@ def load_pickled(path: Path) -> list[Shaped[np.ndarray, "..."]]:
         with path.open("rb") as file:
             found = _objects(file) if path.suffix == ".npy" else _Arrays(file).load()
     except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
+        raise CaptureError("file not found", where=path, do="check the path") from None
     except (pickle.UnpicklingError, ValueError, EOFError, TypeError, AttributeError) as error:
         raise CaptureError(
             "cannot read arrays from a pickled file",

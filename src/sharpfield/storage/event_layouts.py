@@ -132,7 +132,7 @@ def open_events(
     """
     path = Path(path)
     if not path.is_file():
-        raise CaptureError("event file not found", where=path)
+        raise CaptureError("event file not found", where=path, do="check the path")
     opened = _open_npz(path) if path.suffix == ".npz" else _open_hdf5(path, camera)
     counts = {name: len(column) for name, column in opened.columns.items()}
     if len(set(counts.values())) != 1:
@@ -296,6 +296,7 @@ def _column(group: h5py.Group, name: str) -> h5py.Dataset:
         "an event column must be a one-dimensional array of numbers",
         where=f"{group.file.filename}, {column.name}",
         got=column,
+        do="store x, y, t and p as arrays of equal length",
     )
 
 

@@ -78,7 +78,12 @@ class Table:
             raise CaptureError(f"`{key}` is missing", where=self.where, do="add it")
         accepted = (int, float) if kind is float else kind
         if not isinstance(value, accepted) or isinstance(value, bool) != (kind is bool):
-            raise CaptureError(f"`{key}` must be {KINDS[kind]}", where=self.where, got=repr(value))
+            raise CaptureError(
+                f"`{key}` must be {KINDS[kind]}",
+                where=self.where,
+                got=repr(value),
+                do="correct the value",
+            )
         return value
 
 
@@ -91,6 +96,6 @@ def read_toml(path: Path) -> Table:
     try:
         return Table(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
+        raise CaptureError("file not found", where=path, do="check the path") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError("not valid TOML", where=path, got=error) from None
+        raise CaptureError("not valid TOML", where=path, got=error, do="correct the file") from None

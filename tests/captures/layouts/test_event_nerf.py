@@ -98,7 +98,7 @@ def test_distortion_is_in_the_fifth_row(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("pose/r_00001.txt", "1 2 three", "not a file of numbers"),
+        ("pose/r_00001.txt", "1 2 three", "cannot read the numbers of a text"),
         ("pose/r_00001.txt", "1 2 3", "there must be 16 numbers"),
         ("intrinsics/r_00000.txt", "1 2 3", "there must be 16 or 20 numbers"),
     ],

@@ -61,6 +61,7 @@ def read_poses_bounds(path: Path) -> PosesBounds:
             "the cameras of a scene must have one size and focal length",
             where=f"{path}, columns 5, 10 and 15",
             got=f"focal lengths from {intrinsics[:, 2].min():g} to {intrinsics[:, 2].max():g}",
+            do="use the images of one camera",
         )
     bounds = rows[:, 15:]
     wrong = np.flatnonzero((bounds[:, 0] <= 0) | (bounds[:, 1] <= bounds[:, 0]))
@@ -69,6 +70,7 @@ def read_poses_bounds(path: Path) -> PosesBounds:
             "depth bounds must satisfy 0 < near < far",
             where=f"{path}, row {wrong[0]}, last two columns",
             got=f"{bounds[wrong[0], 0]:g}, {bounds[wrong[0], 1]:g}",
+            do="correct these two columns",
         )
     height, width, focal = intrinsics[0]
     return PosesBounds(poses, float(width), float(height), float(focal), bounds)

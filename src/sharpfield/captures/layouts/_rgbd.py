@@ -182,9 +182,14 @@ def read_matrix(path: Path) -> Shaped[np.ndarray, "r c"]:
     try:
         return np.loadtxt(path, ndmin=2)
     except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
+        raise CaptureError("file not found", where=path, do="check the path") from None
     except (ValueError, UnicodeDecodeError) as error:
-        raise CaptureError("cannot read the numbers of a text", where=path, got=error) from None
+        raise CaptureError(
+            "cannot read the numbers of a text",
+            where=path,
+            got=error,
+            do="write numbers only, a row per line",
+        ) from None
 
 
 def read_pose(path: Path) -> Float64[np.ndarray, "3 4"]:
@@ -196,7 +201,10 @@ def read_pose(path: Path) -> Float64[np.ndarray, "3 4"]:
     matrix = read_matrix(path)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise CaptureError(
-            "a pose must have 4 columns and 3 or 4 rows", where=path, got=matrix.shape
+            "a pose must have 4 columns and 3 or 4 rows",
+            where=path,
+            got=matrix.shape,
+            do="write a 3x4 or 4x4 matrix, a row per line",
         )
     return matrix[:3].astype(np.float64)
 

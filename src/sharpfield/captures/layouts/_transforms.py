@@ -47,11 +47,16 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
+        raise CaptureError("file not found", where=path, do="check the path") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise CaptureError("not a JSON file", where=path, got=error) from None
+        raise CaptureError("not a JSON file", where=path, got=error, do="write it again") from None
     if not isinstance(content, dict):
-        raise CaptureError("must be a JSON object", where=path, got=type(content).__name__)
+        raise CaptureError(
+            "must be a JSON object",
+            where=path,
+            got=type(content).__name__,
+            do='write { "frames": [...], ... }',
+        )
     return content
 
 
@@ -84,7 +89,11 @@ def poses_of(frames: Sequence[dict[str, Any]], where: object) -> Float64[np.ndar
     except (ValueError, TypeError):
         matrices = np.zeros(0)
     if matrices.shape[1:] not in ((4, 4), (3, 4)):
-        raise CaptureError("each `transform_matrix` must be 4x4 or 3x4 numbers", where=where)
+        raise CaptureError(
+            "each `transform_matrix` must be 4x4 or 3x4 numbers",
+            where=where,
+            do="write camera-to-world matrices",
+        )
     poses = matrices[:, :3] * OPENCV_FROM_OPENGL  # [n, 3, 4]
     check_poses(poses, where)
     return poses
@@ -115,7 +124,7 @@ def number(content: dict[str, Any], key: str, where: object) -> float:
     """
     value = content.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise CaptureError(f"`{key}` must be a number", where=where, got=value)
+        raise CaptureError(f"`{key}` must be a number", where=where, got=value, do="write a number")
     return float(value)
 
 
@@ -179,7 +188,12 @@ def read_views(path: Path, *, timed: bool = True) -> ViewSet:
     frames = frames_of(content, path)
     angle = number(content, "camera_angle_x", path)
     if not 0 < angle < math.pi:
-        raise CaptureError("`camera_angle_x` must lie between 0 and pi rad", where=path, got=angle)
+        raise CaptureError(
+            "`camera_angle_x` must lie between 0 and pi rad",
+            where=path,
+            got=angle,
+            do="write the horizontal field of view in rad",
+        )
     time = [_time(frame, f"{path}, frame {i}") if timed else 0.0 for i, frame in enumerate(frames)]
     files = [frame["file_path"] for frame in frames]
     return ViewSet(
@@ -253,11 +267,17 @@ def expect_one_camera(sets: Sequence[ViewSet], where: Path) -> None:
             got=", ".join(
                 f"camera_angle_x {angle}, focal {focal}" for angle, focal in sorted(seen)
             ),
+            do="use sets of one camera",
         )
 
 
 def _time(frame: dict[str, Any], where: str) -> float:
     time = number(frame, "time", where)
     if not 0 <= time <= 1 + 1e-5:
-        raise CaptureError("`time` must lie between 0 and 1", where=where, got=time)
+        raise CaptureError(
+            "`time` must lie between 0 and 1",
+            where=where,
+            got=time,
+            do="divide times by the duration of the recording",
+        )
     return min(time, 1.0)

@@ -271,7 +271,9 @@ def _parsing(path: Path, line: str) -> Iterator[None]:
     try:
         yield
     except (ValueError, IndexError):
-        raise CaptureError("cannot read a line of a COLMAP file", where=path, got=line) from None
+        raise CaptureError(
+            "cannot read a line of a COLMAP file", where=path, got=line, do="export the model again"
+        ) from None
 
 
 def _found(path: Path) -> Path:

@@ -189,6 +189,7 @@ def _set(folder: Path, name: str) -> _Set:
             "frames must be in the order of views, each from time 0 to 1",
             where=path,
             got=f"{len(views)} frames, {count} of them at time 1",
+            do="order frames by view, then by time",
         )
     time = views.time.reshape(count, -1)
     poses = views.poses.reshape(count, -1, 12)

@@ -20,6 +20,7 @@ from jaxtyping import Float64, Int64, Shaped
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import estimated_bounds
+from sharpfield.captures.layouts._rgbd import read_matrix
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.errors import CaptureError
@@ -159,13 +160,13 @@ def _poses(folder: Path) -> Float64[np.ndarray, "p 3 4"]:
 
 def _numbers(path: Path, counts: tuple[int, ...]) -> Shaped[np.ndarray, "n"]:
     """The numbers of a text file, whose count must be one of `counts`."""
-    try:
-        numbers = np.array([float(word) for word in path.read_text().split()])
-    except (ValueError, UnicodeDecodeError) as error:
-        raise CaptureError("not a file of numbers", where=path, got=error) from None
+    numbers = read_matrix(path).ravel()
     if len(numbers) not in counts:
         raise CaptureError(
-            f"there must be {' or '.join(map(str, counts))} numbers", where=path, got=len(numbers)
+            f"there must be {' or '.join(map(str, counts))} numbers",
+            where=path,
+            got=len(numbers),
+            do="write a matrix of 4x4, row by row",
         )
     return numbers
 

@@ -90,7 +90,12 @@ def _points(folder: Path, content: dict[str, Any], path: Path) -> Float64[np.nda
     if file is None:
         return None
     if not isinstance(file, str):
-        raise CaptureError("`ply_file_path` must be text", where=path, got=file)
+        raise CaptureError(
+            "`ply_file_path` must be text",
+            where=path,
+            got=file,
+            do="write the path of the .ply file",
+        )
     ply = folder / file
     points = columns(read_ply(ply), ("x", "y", "z"), where=ply).astype(np.float64)
     return points if len(points) else None

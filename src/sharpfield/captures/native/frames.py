@@ -60,7 +60,10 @@ def decode_depth(path: Path) -> UInt16[np.ndarray, "h w"]:
     image = read_image(path)
     if image.dtype != np.uint16 or image.shape[-1] != 1:
         raise CaptureError(
-            "a depth map must be a grey image of 16 bit", where=path, got=describe(image)
+            "a depth map must be a grey image of 16 bit",
+            where=path,
+            got=describe(image),
+            do="write 16-bit PNG files",
         )
     return image[..., 0]
 
@@ -186,6 +189,7 @@ def _expect_like(
             "sharp images differ from the frames in size or type",
             where=where,
             got=f"{describe(found[0])}, frames {describe(images[0])}",
+            do="write sharp images with the size and type of the frames",
         )
 
 
@@ -205,6 +209,7 @@ def _read_geometry(
                 f"{name} differs from the frames in size or type",
                 where=path,
                 got=f"{values.dtype} {values.shape}, expected float32 {expected}",
+                do="write an array of this type and shape",
             )
         found[name] = values
     return found
@@ -257,6 +262,7 @@ def _expect_same_kind(frames: Frames) -> None:
         raise CaptureError(
             "sharp images must have the size and type of the frames",
             got=f"{truth.dtype} {truth.shape}, frames {frames.images.dtype} {frames.images.shape}",
+            do="convert the sharp images",
         )
 
 

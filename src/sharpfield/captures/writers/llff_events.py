@@ -132,6 +132,7 @@ def _stamps(capture: Capture) -> Stamps:
             "this layout needs a moving camera, whose poses are known over time",
             where=capture.name,
             got="a static camera",
+            do="write our own layout instead",
         )
     count = -(-(known[1] - known[0]) // STAMP_US)
     times_us = np.minimum(known[0] + np.arange(count + 1) * STAMP_US, known[1]).astype(np.int64)
