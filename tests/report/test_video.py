@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.report.video import open_video, write_video
+from sharpfield.report.video import video_writer, write_video
 from sharpfield.storage.images import list_images, read_images
 
 
@@ -16,7 +16,7 @@ def images(count=6, size=(50, 80), channels=3):
 
 def test_a_video_plays_in_browsers_and_shows_the_images(tmp_path):
     path = tmp_path / "videos" / "a.mp4"
-    assert write_video(path, images(), rate=24.0) == 6
+    assert write_video(path, images(), fps=24.0) == 6
     with av.open(path) as file:
         stream = file.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
@@ -48,7 +48,7 @@ def test_a_folder_gets_the_exact_images(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.mp4", "frames"])
 def test_a_video_that_breaks_off_leaves_nothing(tmp_path, name):
-    with pytest.raises(KeyboardInterrupt), open_video(tmp_path / name) as write:
+    with pytest.raises(KeyboardInterrupt), video_writer(tmp_path / name) as write:
         write(next(images()))
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -65,4 +65,4 @@ def test_options_that_make_no_video(tmp_path):
     with pytest.raises(OptionError, match="unknown kind of video"):
         write_video(tmp_path / "a.avi", images())
     with pytest.raises(OptionError, match="positive frame rate"):
-        write_video(tmp_path / "a.mp4", images(), rate=0.0)
+        write_video(tmp_path / "a.mp4", images(), fps=0.0)

@@ -32,8 +32,8 @@ CAMERAS = 2
 """Most cameras with a video, evenly spread over those held out."""
 WINDOWS = 20
 """Windows of a video; together they cover the capture."""
-RATE = 8.0
-"""Windows per second."""
+FPS = 8.0
+"""Windows per second of the video."""
 HEIGHT_PX = 240
 """Smaller images are enlarged by a whole factor up to this height."""
 GAP_PX = 4
@@ -62,7 +62,7 @@ def write_event_videos(model: Model, capture: Capture, run: Path) -> list[dict[s
     for track in chosen.astype(int).tolist():
         path = Path("renders") / "events" / f"{track:02d}.mp4"
         (run / path).parent.mkdir(parents=True, exist_ok=True)
-        write_video(run / path, _images(model, capture, track), rate=RATE)
+        write_video(run / path, _images(model, capture, track), fps=FPS)
         found.append({"track": track, "video": path.as_posix()})
     return found
 

@@ -32,7 +32,7 @@ COUNTS, FRAMES, VIDEO = "counts.npy", "frames.npy", "frames.mp4"
 PUBLISHED_SHARE = 0.3
 """Smallest share of the largest count of a frame that the published figures show."""
 
-RATE = 20.0
+FPS = 20.0
 """Windows per second of the video."""
 
 Append = Callable[[Int32[np.ndarray, "h w 2"]], None]
@@ -146,7 +146,7 @@ def _draw(folder: Path, frames: Int32[np.ndarray, "n h w"], full: float) -> None
             write_image(folder / f"{number:04d}.png", image)
             yield image
 
-    write_video(folder / VIDEO, drawn(), rate=RATE)
+    write_video(folder / VIDEO, drawn(), fps=FPS)
 
 
 def full_count(frames: Int32[np.ndarray, "*n h w"]) -> float:

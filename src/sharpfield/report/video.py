@@ -37,20 +37,20 @@ class Writer(Protocol):
 
 
 @contextmanager
-def open_video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
+def video_writer(path: Path, *, fps: float = 30.0) -> Iterator[Writer]:
     """Open a video; gives a function that appends images, all of one size.
 
     Args:
         path: Ends in `.mp4` for a video; anything without a suffix is a folder of PNGs.
-        rate: Frames per second of the video.
+        fps: Frames per second of the video.
 
     Raises:
-        OptionError: Another suffix, a rate that is not positive, or a folder with other files.
+        OptionError: Another suffix, fps that are not positive, or a folder with other files.
     """
     if path.suffix.lower() == ".mp4":
-        if not rate > 0:
-            raise OptionError("a video needs a positive frame rate", got=rate)
-        with _mp4(path, rate) as write:
+        if not fps > 0:
+            raise OptionError("a video needs a positive frame rate", got=fps)
+        with _mp4(path, fps) as write:
             yield write
     elif path.suffix and not path.is_dir():
         raise OptionError(
@@ -61,10 +61,10 @@ def open_video(path: Path, *, rate: float = 30.0) -> Iterator[Writer]:
             yield write
 
 
-def write_video(path: Path, images: Iterable[Image], *, rate: float = 30.0) -> int:
-    """Write images as they are made; returns their number. See `open_video`."""
+def write_video(path: Path, images: Iterable[Image], *, fps: float = 30.0) -> int:
+    """Write images as they are made; returns their number. See `video_writer`."""
     count = 0
-    with open_video(path, rate=rate) as write:
+    with video_writer(path, fps=fps) as write:
         for image in images:
             write(image)
             count += 1
@@ -86,13 +86,13 @@ def _folder(path: Path) -> Iterator[Writer]:
 
 
 @contextmanager
-def _mp4(path: Path, rate: float) -> Iterator[Writer]:
+def _mp4(path: Path, fps: float) -> Iterator[Writer]:
     import av
     from av.video.reformatter import Colorspace
 
     with replacing(path) as temporary:
         with av.open(temporary, "w", options={"movflags": "faststart"}) as file:
-            stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1001))
+            stream = file.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
             _set_up(stream.codec_context)
 
             def write(image: Image) -> None:

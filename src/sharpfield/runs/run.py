@@ -270,7 +270,7 @@ class Run:
         numbers = track(
             range(len(moves)), "rendering", console=console, disable=not console.is_terminal
         )
-        return write_video(Path(out), (rendered(number) for number in numbers), rate=float(fps))
+        return write_video(Path(out), (rendered(number) for number in numbers), fps=float(fps))
 
     def evaluate(
         self,
