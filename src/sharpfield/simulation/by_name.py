@@ -1,4 +1,4 @@
-"""A capture of a scene by its name, whether it stands still, moves, or is a room to walk through.
+"""Simulated captures of scenes by name: static scenes, moving scenes, or the room.
 
 Each group of options has a default for every field, and ignores what a kind of scene does not have.
 """
@@ -27,20 +27,20 @@ class RoomOptions:
     """A walk through the room, whose frames come with measured depth."""
 
     blurry: float = 0.75
-    """Share of the room's training frames that is blurred."""
+    """Fraction of the room's training frames that is blurred."""
     blur: Literal["motion", "published"] = "motion"
-    """By the walk, or each image by a random kernel, as published."""
+    """By the motion of the camera, or each image by a random kernel, as published."""
     events: bool = False
-    """Whether an event camera walks along; other scenes always have one."""
+    """Whether to simulate an event camera in the room; other scenes always have one."""
     depth_noise: float = 0.0
     """Standard deviation in metres of depth at one metre; it grows with the square of depth, and
     there are holes at edges, at grazing angles and beyond 5 m. A Kinect's is 0.0014."""
     drift: float = 0.0
-    """Metres by which poses stray slowly from the true ones."""
+    """Slow drift of the poses from the true ones, in metres."""
 
     @property
     def sensors(self) -> "RoomSensors":
-        """How well depth and poses are known."""
+        """Accuracy of depth and poses."""
         from sharpfield.simulation.room_capture import RoomSensors
         from sharpfield.simulation.sensors.depth import DepthSensor
 
@@ -67,7 +67,7 @@ ROOM_OPTIONS = RoomOptions()
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """How the simulated camera moves and what its sensors are like."""
+    """Motion and sensors of the simulated camera."""
 
     motion: str = "glide"
     """A camera path by name: glide, shaky."""
@@ -76,13 +76,13 @@ class RecordingOptions:
     threshold: float | None = None
     """Contrast threshold of both signs, instead of the sensor's own."""
     colour: bool = False
-    """Events behind a Bayer filter, and frames in linear light, as a Color-DAVIS346 gives them."""
+    """Events behind a Bayer filter, and frames in linear light, as of a Color-DAVIS346."""
     rolling_shutter_ms: float = 0.0
-    """How much later the last row of a frame is exposed than the first; scenes that stand still."""
+    """Readout time of a frame, from the first row to the last; for static scenes."""
     lens: str = "pinhole"
     """Lens model: pinhole, brown, fisheye, or one of an installed package."""
     distortion: tuple[float, ...] = ()
-    """Its coefficients, as OpenCV's: k1 k2 p1 p2 k3 of brown, k1 k2 k3 k4 of fisheye."""
+    """Distortion coefficients in OpenCV's order: k1 k2 p1 p2 k3 (brown), k1 k2 k3 k4 (fisheye)."""
     walk: RoomOptions = ROOM_OPTIONS
 
     def sensors(self, base: "Rig", size: tuple[int, int]) -> "Rig":
@@ -107,10 +107,10 @@ class RecordingOptions:
 
 @dataclass(frozen=True)
 class RigOptions:
-    """Cameras before a moving scene; scenes that stand still have one, which moves."""
+    """Cameras of a moving scene; static scenes have one, which moves."""
 
     rig: Literal["ring", "hand"] = "ring"
-    """Cameras that stand around it, or one that is carried."""
+    """A ring of static cameras around the scene, or one hand-held camera."""
     views: int = 8
     """Cameras on the ring."""
     held_out: int = 4

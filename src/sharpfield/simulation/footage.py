@@ -1,6 +1,6 @@
 """Blurry frames and events from footage of a fast camera: a folder of images, or a video.
 
-Between two images the logarithm of light goes straight, which is only true of fast footage: a
+Between two images the logarithm of light is taken as linear, which holds only for fast footage: a
 few hundred images per second, or motion of less than about a pixel from one to the next.
 """
 
@@ -28,7 +28,7 @@ IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 @dataclass(frozen=True)
 class Footage:
-    """Sharp images at known times; they are read as they are needed."""
+    """Sharp images at known times, read when needed."""
 
     name: str
     times_us: Int64[np.ndarray, "n"]

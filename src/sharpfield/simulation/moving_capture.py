@@ -1,9 +1,9 @@
-"""One call from a moving scene to a capture of many tracks: every camera of a rig is one.
+"""Simulated captures of moving scenes, with one track for every camera of a rig.
 
-Tracks that move are numbered first, then those that stand still; within each, cameras to learn
-from come before those held out. Held-out cameras take sharp frames, some of which are the test
-set, and their events are kept apart as `test_events`. Every frame has its sharp truth, depth and
-flow in the middle of its exposure.
+Moving tracks are numbered first, then static ones; within each, training cameras come before
+held-out ones. Held-out cameras take sharp frames, some of which are the test set, and their events
+are stored separately as `test_events`. Every frame has its sharp truth, depth and flow in the
+middle of its exposure.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ RING = ring(8, held_out=4)
 
 @dataclass(frozen=True)
 class _Track:
-    """What one camera recorded."""
+    """The recording of one camera."""
 
     frames: Frames
     events: EventStream

@@ -1,9 +1,9 @@
-"""One call from the room to a capture with depth: a walk whose frames are blurred as walks blur.
+"""Simulated captures of a walk through a room, with measured depth and realistic motion blur.
 
-Frames are taken evenly; the shutter is open for the same time in each, as long as it takes for a
-wanted share of them to be blurred. Which ones are sharp is up to the walk: those of its pauses. All
-else is known: the sharp image and the depth in the middle of each exposure, the pose at any time,
-and the true blur of every frame (`Frames.blur_px`, see `simulation.travel`). Held-out frames are
+Frames are evenly spaced and have the same exposure time, which is chosen so that a given fraction
+of them is blurred. Which ones are sharp depends on the walk: those in its pauses. Everything is
+known: the sharp image and the depth in the middle of each exposure, the pose at any time, and the
+true blur of every frame (`Frames.blur_px`, see `cameras.motions.travel`). Held-out frames are
 instants, and therefore sharp.
 """
 
@@ -37,15 +37,15 @@ from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, bl
 from sharpfield.simulation.static_capture import MARGIN_US, Rig, drawn_ahead, view
 
 BLURRY_OF_WIDTH = 0.006
-"""A frame counts as blurry when its points travel this share of the image's width: 1.4 px of 240,
+"""Travel from which a frame counts as blurry, as a fraction of the image's width: 1.4 px of 240,
 3.8 px of 640."""
 STRIDE_PX = 0.8
-"""How far points may travel between two of the images that make up a blurred frame."""
+"""Largest travel between two of the images that are averaged to a blurred frame."""
 MOST_IMAGES = 64
 PROBE_PX = 24
 """Width of the images in which travel is measured."""
 OPEN_OF_INTERVAL = 0.9
-"""Longest exposure over the interval between two."""
+"""Longest exposure, as a fraction of the interval between two."""
 FARTHEST_M = 65.0
 """Depth that 16 bits of millimetres can hold."""
 
@@ -54,25 +54,25 @@ Blur = Literal["motion", "published"]
 
 @dataclass(frozen=True)
 class RoomTiming:
-    """How many frames, how blurred, and which are held out."""
+    """Number of frames, their blur, and which are held out."""
 
     frames: int = 200
     interval_us: int = 100_000
     """From one exposure's start to the next."""
     blurry: float = 0.75
-    """Share of the frames learned from that is blurred."""
+    """Fraction of the training frames that is blurred."""
     blur: Blur = "motion"
-    """By the walk while the shutter is open; or as published, each image by one random kernel."""
+    """By the motion during the exposure; or as published, each image by one random kernel."""
     exposure_us: int | None = None
-    """By default as long as it takes for that share."""
+    """None chooses the exposure for that fraction."""
     test_every: int = 8
-    """Every how many frames one is sharp and held out, the first included; 0 for none."""
+    """One frame in so many is sharp and held out, the first included; 0 for none."""
     train_every: int = 0
-    """Instead: learn from one frame in so many, and hold all others out, as published (5)."""
+    """Instead: train on one frame in so many, and hold out all others, as published (5)."""
     events: bool = False
-    """Whether an event camera watches, too; takes several times longer."""
+    """Whether to simulate an event camera, too; takes several times longer."""
     step_us: int = 4000
-    """Between two of the images it watches."""
+    """Time between two images of the event camera."""
 
     def __post_init__(self) -> None:
         if self.frames < 2 or self.interval_us < 1000 or self.step_us < 1:
@@ -107,11 +107,11 @@ class RoomTiming:
 
 @dataclass(frozen=True)
 class RoomSensors:
-    """What is known of the room besides its frames, and how well; exactly by default."""
+    """Accuracy of the measured depth and poses; exact by default."""
 
     depth: DepthSensor = DepthSensor()
     drift: float = 0.0
-    """Metres by which the poses of the capture stray from the true ones, slowly."""
+    """Slow drift of the poses from the true ones, in metres."""
 
 
 ROOM_RIG, ROOM_TIMING, ROOM_SENSORS = Rig(size=(240, 180)), RoomTiming(), RoomSensors()
@@ -130,8 +130,8 @@ def simulate_room(
     Args:
         rig: Sensors and their numbers.
         timing: Frames, their blur, and which are held out.
-        sensors: How well depth and poses are known.
-        kernels: What published blur is drawn from; its probability is `timing.blurry`.
+        sensors: Accuracy of depth and poses.
+        kernels: Ranges of the published blur; its probability is `timing.blurry`.
         seed: Of the walk, the kernels and the noise.
 
     Returns:
@@ -171,12 +171,12 @@ def simulate_room(
 
 
 def _stored(depth: Float[np.ndarray, "h w"]) -> UInt16[np.ndarray, "h w"]:
-    """In millimetres; 0 where 16 bits cannot hold them."""
+    """In millimetres; 0 where they exceed 16 bits."""
     return np.rint(np.where(depth < FARTHEST_M, depth / MILLIMETRE, 0)).astype(np.uint16)
 
 
 class _Probe:
-    """How points travel during each frame, from small images."""
+    """Travel of points during each frame, measured in small images."""
 
     def __init__(
         self, place: Scene, camera: Camera, path: CameraPath, middle_us: Int64[np.ndarray, "n"]
@@ -218,7 +218,7 @@ def _exposure(probe: _Probe, camera: Camera, timing: RoomTiming) -> Exposure:
 
 
 def _times(probe: _Probe, exposure: Exposure, timing: RoomTiming) -> Int64[np.ndarray, "k"]:
-    """When to draw a image: often enough during exposures, and evenly for events."""
+    """Times of the images to render: often enough during exposures, and evenly for events."""
     times = []
     for i in range(len(exposure)):
         far = float(np.quantile(probe.travel(i, exposure.window(i)), 0.95))
@@ -243,7 +243,7 @@ def _images(
 
 
 class _Recorded:
-    """Frames, finished one after the other so that only one is held in full precision; events."""
+    """Frames, one after the other so that only one is held in full precision; and events."""
 
     def __init__(self, exposure: Exposure, rig: Rig, seed: int, *, events: bool) -> None:
         self._exposure, self._rig, self._seed = exposure, rig, seed
@@ -259,7 +259,7 @@ class _Recorded:
     def see(
         self, t_us: int, rgb: Float32[np.ndarray, "h w 3"], depth: Float32[np.ndarray, "h w"]
     ) -> None:
-        """A image, after all earlier ones."""
+        """An image, after all earlier ones."""
         if self._pixels is not None:
             self._gaps.append(self._pixels.see(rgb, 1000 * t_us))
         i = self._frame
@@ -292,13 +292,13 @@ class _Recorded:
         )
 
     def events(self) -> EventStream | None:
-        """All events, if there was an event camera."""
+        """All events, if there is an event camera."""
         if self._pixels is None:
             return None
         return joined(self._gaps, self._rig.size, bayer=self._rig.event_sensor.bayer)
 
     def known(self) -> Known:
-        """What a capture knows about the event camera, if there was one."""
+        """What a capture knows about the event camera, if there is one."""
         return Known() if self._pixels is None else self._pixels.known()
 
     def notes(self) -> dict[str, Note]:
@@ -309,7 +309,7 @@ class _Recorded:
 def _as_published(
     frames: Frames, held_out: Bool[np.ndarray, "n"], ranges: KernelRange, seed: int
 ) -> tuple[Frames, Float64[np.ndarray, "n"]]:
-    """Frames learned from blurred by a random kernel each, and how far each kernel reaches."""
+    """Training frames blurred by a random kernel each, and the length of each kernel."""
     images, blur = frames.images.copy(), np.zeros(len(frames))
     for i in np.flatnonzero(~held_out):
         drawn = drawn_blur(ranges, numpy_generator(seed, int(i), "kernel"))

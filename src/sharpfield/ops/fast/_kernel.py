@@ -1,13 +1,13 @@
 # pyright: basic
-"""How kernels are compiled, and how they share the CPU.
+"""Compilation of CPU kernels by numba, and their execution on several threads.
 
 Vocabulary: a *kernel* is a function of numpy arrays that numba compiles, once per set of types and
-machine; the result is kept beside the source, or in the user's cache folder where that cannot be
-written. Kernels see the memory of torch tensors, never copies. A kernel that is *spread* runs once
-per *worker*, each doing its share.
+machine; the result is cached beside the source, or in the user's cache folder if that is not
+writable. Kernels work on the memory of torch tensors, without copies. A kernel that is *spread*
+runs once per *worker* (thread), each processing its share.
 
-Every kernel gives the same bits on every run: what a number is made of, and in which order, depends
-neither on the number of workers nor on which is faster.
+Every kernel gives the same bits on every run: the terms of each sum and their order do not depend
+on the number of workers or on their speed.
 """
 
 import functools
@@ -61,7 +61,7 @@ if hasattr(os, "register_at_fork"):
 
 @kernel
 def share(worker, workers, count):
-    """Where a worker's share of `count` things begins and ends."""
+    """First and one-past-last index of a worker's share of `count` items."""
     return count * worker // workers, count * (worker + 1) // workers
 
 

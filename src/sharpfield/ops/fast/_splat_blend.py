@@ -1,10 +1,10 @@
 # pyright: basic
-"""Blending splats in tiles, and back. A row of a tile is one vector of the CPU.
+"""Blending of splats in tiles, and its gradient. A row of a tile is one vector register.
 
 A *splat* is a row of numbers: centre x, y, conic xx, xy, yy, opacity, half its height in pixels,
-then its *features*: the colour's channels and depth. A *touch* is a splat that reaches a tile: the
-splat's number, and the place where its gradient goes. A *plan* says where each worker's tiles and
-each tile's touches begin, and lists the touches.
+then its *features*: the colour's channels and depth. A *touch* is a splat that overlaps a tile: the
+splat's number, and the index where its gradient is written. A *plan* holds the offsets of each
+worker's tiles and of each tile's touches, and the touches.
 """
 
 import numpy as np
@@ -33,10 +33,10 @@ GEOMETRY = 7
 """Numbers of a splat before its features."""
 
 DARK = 1e-5
-"""A tile is finished when less than this share of light gets through everywhere."""
+"""A tile is finished when its transmittance is below this at every pixel."""
 
-LOOK = 16
-"""Touches between two looks at whether a tile is finished."""
+CHECK_EVERY = 16
+"""Touches between two checks whether a tile is finished."""
 
 FAINT, FULL = np.float32(FAINTEST), np.float32(MOST)
 ONE, HALF = np.float32(1), np.float32(0.5)
@@ -52,7 +52,7 @@ def _rows(splat, top, height):
 
 @kernel
 def _finished(left, height):
-    """Whether next to no light gets through a tile any more."""
+    """Whether the transmittance of a tile is negligible everywhere."""
     for i in range(height * TILE):
         if left[i] > DARK:
             return False
@@ -73,7 +73,7 @@ def _place(item, images):
 
 @kernel
 def blend(worker, workers, plan, splats, images, lanes, features):
-    """Fill `images [v h w f+1]` with the sums of the features, and the light that gets through."""
+    """Fill `images [v h w f+1]` with the weighted sums of the features, and the transmittance."""
     shares, starts, touches = plan
     left = np.empty(TILE * TILE, np.float32)
     sums = np.empty(len(features) * TILE * TILE, np.float32)
@@ -82,7 +82,7 @@ def blend(worker, workers, plan, splats, images, lanes, features):
         left[:] = ONE
         sums[:] = 0.0
         for touch in range(starts[item], starts[item + 1]):
-            if (touch - starts[item]) % LOOK == LOOK - 1 and _finished(left, height):
+            if (touch - starts[item]) % CHECK_EVERY == CHECK_EVERY - 1 and _finished(left, height):
                 break
             splat = splats[touches[touch, 0]]
             dx = count_up(np.float32(corner) + HALF - splat[0], lanes)
@@ -110,10 +110,10 @@ def blend(worker, workers, plan, splats, images, lanes, features):
 
 @kernel
 def _wanted_of_tile(item, images, wanted, gradient, behind, features):
-    """The gradient of every feature at every pixel, and what is behind the first splat.
+    """The gradient of every feature at every pixel, and `behind` for the first splat.
 
-    *Behind* is how much the loss would fall if the light from behind were stopped: the gradient
-    times all that is still to come, minus that of the opacity times the light that gets through.
+    *Behind* is the gradient of the loss by the transmittance at a splat: the gradient times the sum
+    of all features behind it, minus that of the opacity times the final transmittance.
     """
     view, top, corner, height, width = _place(item, images)
     gradient[:] = 0.0
@@ -151,7 +151,7 @@ def blend_back(worker, workers, plan, splats, views, touch_sums, lanes, features
         finished = False
         for touch in range(starts[item], starts[item + 1]):
             out = touch_sums[touches[touch, 1]]
-            if not finished and (touch - starts[item]) % LOOK == LOOK - 1:
+            if not finished and (touch - starts[item]) % CHECK_EVERY == CHECK_EVERY - 1:
                 finished = _finished(left, height)
             if finished:
                 out[:] = 0.0

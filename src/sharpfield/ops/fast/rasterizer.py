@@ -1,11 +1,11 @@
 # pyright: basic
-"""Gaussians drawn in tiles: on the CPU by kernels of our own, on CUDA by those of gsplat.
+"""Tile-based rasterization of Gaussians: on the CPU by our own kernels, on CUDA by gsplat.
 
-On the CPU every Gaussian is projected into all views and listed in the tiles that its splat can
-reach; one entry of such a list is a *touch*. A tile's touches are blended from front to back, a row
-of pixels at a time. On the way back each touch writes its own gradient, and each Gaussian adds up
-those of its touches in a fixed order: no two threads ever write to the same place, and the sums do
-not depend on how many there are.
+On the CPU every Gaussian is projected into all views and listed in the tiles that its splat
+overlaps; one entry of such a list is a *touch* (a tile-splat intersection). A tile's touches are
+blended from front to back, a row of pixels at a time. In the backward pass each touch writes its
+own gradient, and each Gaussian adds up those of its touches in a fixed order: no two threads write
+to the same memory, and the sums do not depend on the number of threads.
 """
 
 from math import ceil
@@ -94,7 +94,7 @@ def _rim(shift: Float[Tensor, "v n 2"], camera: Camera) -> int:
 def _as_matrices(
     poses: Float[Tensor, "v 3 4"], canvas: Canvas, rim: int
 ) -> tuple[Float[Tensor, "v 4 4"], Float[Tensor, "v 3 3"]]:
-    """Camera-from-world, and the lens."""
+    """Camera-from-world matrices, and intrinsics."""
     inward = poses[:, :, :3].mT
     last = poses.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(poses), 1, 4)
     camera_from_world = torch.cat([inward, -inward @ poses[:, :, 3:]], -1)
@@ -160,7 +160,7 @@ class _Rasterize(torch.autograd.Function):
 
 
 def _lens(canvas: Canvas) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Focal lengths, largest slopes and size; the principal point in each view's part; mode."""
+    """Focal lengths, largest x/z and y/z, size; principal point in each view's part; mode."""
     camera = canvas.camera
     numbers = [camera.fx_px, camera.fy_px, *canvas.reach(), *canvas.size]
     middle = np.array([camera.cx_px, camera.cy_px]) - canvas.corner.cpu().numpy()
@@ -168,7 +168,7 @@ def _lens(canvas: Canvas) -> tuple[np.ndarray, np.ndarray, bool]:
 
 
 def _shares(starts: np.ndarray) -> np.ndarray:
-    """Where each worker's tiles begin and end, so that all have about as many touches."""
+    """First tile of each worker, so that all have about the same number of touches."""
     workers = torch.get_num_threads()
     # A tile without touches costs something, too.
     cost = starts + 8 * np.arange(len(starts))

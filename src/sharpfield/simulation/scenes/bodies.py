@@ -1,10 +1,10 @@
-"""Surfaces that move together: each belongs to a *body*, and bodies move in closed form.
+"""Moving bodies: groups of surfaces with a common motion in closed form.
 
-A body's motion is an affine map from its own axes at rest to the world, as a function of time:
-a rotation and a shift for what is rigid, with stretch and shear for what deforms. Textures are
-fixed to the body, so they stretch with it. Body 0 stands still.
+A body's motion is an affine map from its own axes at rest to the world, as a function of time: a
+rotation and a translation for rigid bodies, with stretch and shear for deforming ones. Textures are
+fixed to the body, so they are stretched with it. Body 0 is static.
 
-A ball stays a ball: it takes the mean stretch of its body. Everything else is deformed exactly.
+A ball stays a ball, scaled by the mean stretch of its body; other surfaces are deformed exactly.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ Map = Float64[np.ndarray, "3 4"]
 
 @dataclass(frozen=True)
 class Bodies:
-    """Which body each surface belongs to, and how the bodies move."""
+    """The body of each surface, and the motions of the bodies."""
 
     body: Int64[np.ndarray, "n"]
     maps: Callable[[float], Sequence[Map]]
@@ -60,13 +60,13 @@ class Bodies:
 def placed(
     at: Vector = (0.0, 0.0, 0.0), *, yaw: Real = 0.0, pitch: Real = 0.0, roll: Real = 0.0
 ) -> Map:
-    """A rigid map for a world whose z axis points up: turned, then shifted.
+    """A rigid map for a world whose z axis points up: a rotation, then a translation.
 
     Args:
-        at: Where the body's origin goes.
-        yaw: Turn about z, rad; the last of the three.
-        pitch: Turn about y.
-        roll: Turn about x; the first.
+        at: Position of the body's origin.
+        yaw: Rotation about z, rad; the last of the three.
+        pitch: Rotation about y.
+        roll: Rotation about x; the first.
     """
     (cz, sz), (cy, sy), (cx, sx) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
     about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
@@ -76,7 +76,7 @@ def placed(
 
 
 def after(outer: Map, inner: Map) -> Map:
-    """First `inner`, then `outer`: a joint that rides on another."""
+    """First `inner`, then `outer`: a joint mounted on another."""
     linear = outer[:, :3] @ inner[:, :3]
     return np.concatenate([linear, outer[:, :3] @ inner[:, 3:] + outer[:, 3:]], 1)
 

@@ -1,4 +1,4 @@
-"""Put a scene together: coloured, textured surfaces in front of a camera that looks along +z.
+"""Constructors of surfaces, and the assembly of scenes for a camera that looks along +z.
 
 World axes are OpenCV's (x right, y down, z away), so the floor lies at positive y.
 """

@@ -1,9 +1,9 @@
-"""Scenes in which something moves, for cameras all around: rigid, articulated, deforming.
+"""Moving scenes for cameras all around: rigid, articulated and deforming objects.
 
-The world's z axis points up. All that moves stays within 1.2 of the origin, before an even grey.
-Motions take about a second and never rest. As seen from 4 away and 30 degrees above, depths are 2
-to 6.5. Some stand on a patterned table that stands still, which events cannot show; those of
-`ALONE` are all that there is to see, as in the data that EvDNeRF (WACV 2024) was shown on.
+The world's z axis points up. Moving objects stay within 1.2 of the origin, in front of a uniform
+grey background. Motions have a period of about a second and never stop. From a distance of 4 and an
+elevation of 30 degrees, depths are 2 to 6.5. Some scenes include a static patterned table, which
+makes no events; those of `ALONE` have nothing static, as in the data of EvDNeRF (WACV 2024).
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ TABLE: list[Part] = [
         box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)),
     ),
 ]
-"""What some of them stand on."""
+"""Static parts of some scenes."""
 
 
 def moving_scene(name: str) -> Scene:
@@ -258,7 +258,7 @@ def _puppet() -> Moving:
 
 
 ALONE: dict[str, Callable[[], Moving]] = {"glider": _glider, "puppet": _puppet}
-"""Scenes in which nothing stands still."""
+"""Scenes without static parts."""
 
 MOVING_SCENES: dict[str, Callable[[], Moving]] = {
     "spinner": _spinner,

@@ -1,7 +1,7 @@
-"""Scenes with known light: closed-form, textured, with occlusion and depth, in front of a camera.
+"""Static scenes in closed form, textured, with occlusion and depth.
 
-All are made for a camera near the origin that looks along +z (x right, y down) and moves half a
-unit sideways; the nearest things are about 2 away, the farthest 7. Fine detail (letters, leaves,
+All are designed for a camera near the origin that looks along +z (x right, y down) and moves half a
+unit sideways; surfaces are at distances of about 2 to 7. Fine detail (letters, leaves,
 tiles) is there to be destroyed by blur and found again.
 """
 
@@ -28,7 +28,7 @@ from sharpfield.simulation.scenes.textures import (
 
 @dataclass(frozen=True)
 class Scene:
-    """Light anywhere, in any direction, at any time."""
+    """A scene whose light can be evaluated along any ray at any time."""
 
     name: str
     surfaces: Surfaces
@@ -36,10 +36,10 @@ class Scene:
     """Depth in front of all surfaces, for a camera near the origin."""
     far: float
     bodies: Bodies | None = None
-    """How surfaces move; None where they stand still or sway."""
+    """Motion of the surfaces; None if they are static or sway."""
 
     def at(self, time_s: float) -> Surfaces:
-        """The surfaces at a time in seconds; those that sway do so when they are traced."""
+        """The surfaces at a time in seconds; sway is added when they are traced."""
         return self.surfaces if self.bodies is None else self.bodies.at(self.surfaces, time_s)
 
     def followed(
@@ -49,11 +49,11 @@ class Scene:
         time_s: float,
         later_s: float,
     ) -> Float64[np.ndarray, "n 3"]:
-        """Where points on surfaces are at another time.
+        """Positions of points on surfaces at another time.
 
         Args:
             points: In the world, at `time_s`.
-            which: The surface that each belongs to; -1 for one that stands still.
+            which: The surface of each; -1 for a static point.
             time_s: Seconds.
             later_s: Seconds; may be earlier.
         """
@@ -80,7 +80,7 @@ class Scene:
         Args:
             origin: One for each ray, or one for all.
             direction: Any length; with a z of 1 in the camera, depth is the camera's z.
-            time_s: Seconds, for scenes in which something moves.
+            time_s: Seconds, for moving scenes.
             footprint_rad: Angle between neighbouring pixels: 1 / focal length in px.
         """
         return trace(self.at(time_s), origin, direction, time_s, footprint_rad)
@@ -197,7 +197,7 @@ def _shelf() -> Parts:
 
 
 def _tiles() -> Parts:
-    """Three leaning panels before a wall: few surfaces, quick to draw."""
+    """Three leaning panels in front of a wall: few surfaces, fast to render."""
     parts = [
         rectangle(
             (0, 0, 6.0),
@@ -220,7 +220,7 @@ def _tiles() -> Parts:
 
 
 def _mobile() -> Parts:
-    """Toys that swing before a brick wall, each with its own period."""
+    """Toys that swing in front of a brick wall, each with its own period."""
     parts = [
         rectangle(
             (0, 0, 6.0),
@@ -257,4 +257,4 @@ SCENES: dict[str, Callable[[], Parts]] = {
     "tiles": _tiles,
     "mobile": _mobile,
 }
-"""Scenes by name; all stand still but "mobile"."""
+"""Scenes by name; all are static but "mobile", whose toys sway."""

@@ -1,11 +1,11 @@
-"""Light along rays, from rectangles, balls, boxes and cylinders with closed-form textures.
+"""Ray tracing of rectangles, balls, boxes and cylinders with closed-form textures.
 
-Silhouettes are as soft as a pixel is wide: a surface *covers* a share of a ray, and what it leaves
-open goes on to the next surface. Light therefore changes continuously as the camera moves, as
-it does for a real pixel, which looks at an area and not at a point.
+Silhouettes are antialiased over the width of a pixel: a surface *covers* a fraction of a ray, and
+the rest continues to the next surface. Light therefore changes continuously as the camera moves, as
+for a real pixel, which integrates over an area.
 
-Shading is Lambert's, from one sun with soft shadows and an even sky, so that what a point sends
-does not depend on the direction, and all of it is *linear* radiance in `DARKEST`...1.
+Shading is Lambertian, with one sun with soft shadows and a uniform sky, so radiance does not depend
+on the direction. All of it is *linear* radiance in `DARKEST`...1.
 """
 
 from math import asin, atan2, sin, sqrt
@@ -21,11 +21,11 @@ RECTANGLE, BALL, BOX, CYLINDER = range(4)
 """The surfaces."""
 
 DARKEST = 0.02
-"""Least radiance: nothing is ever black, so that logarithms stay finite."""
+"""Smallest radiance, so that logarithms stay finite."""
 LAYERS = 6
-"""Partly covering surfaces followed along a ray before the rest counts as the last."""
+"""Most partly covering surfaces along a ray; the last one counts as opaque."""
 PENUMBRA_RAD = 0.12
-"""How wide the sun is."""
+"""Angular diameter of the sun."""
 NOTHING = 1e9
 """Depth where a ray meets no surface."""
 CENTRE, HALF, AXES, REACH = 1, 4, 7, 17
@@ -33,22 +33,22 @@ CENTRE, HALF, AXES, REACH = 1, 4, 7, 17
 
 
 class Surfaces(NamedTuple):
-    """All surfaces of a scene, as tables of plain numbers, which compiled code passes cheaply."""
+    """All surfaces of a scene, as numeric tables for compiled code."""
 
     shape: Float64[np.ndarray, "n 18"]
     """Kind; centre (3); half extents (3; the first is the radius of a ball or cylinder); the linear
     map from the world to the surface's own axes (9; rows are its x, y and z axes unless it is
-    deformed; a rectangle faces -z, a cylinder is long in y); 1 if it throws a shadow; the radius of
-    a ball around it."""
+    deformed; a rectangle faces -z, a cylinder is along y); 1 if it casts a shadow; the radius of
+    its bounding ball."""
     look: Float64[np.ndarray, "n 16"]
     """Linear RGB of ground, ink and accent (9); texture, cells per unit, seed, slant; page of text
     and its rows and columns."""
     pages: Float32[np.ndarray, "m r c"]
     """Lettering, see `textures.page`; padded to one size."""
     sway: Float64[np.ndarray, "n 4"]
-    """How far the centre swings (x, y, z), and the period in seconds."""
+    """Amplitude of the centre's sway (x, y, z), and its period in seconds."""
     light: Float64[np.ndarray, "4"]
-    """Unit vector towards the sun, and the share of light that comes from everywhere."""
+    """Unit vector towards the sun, and the fraction of ambient light."""
     sky: Float64[np.ndarray, "2 3"]
     """Linear RGB of the sky straight ahead and above."""
 
@@ -62,7 +62,7 @@ def trace(surfaces, origin, direction, time_s, footprint):
         surfaces: The scene.
         origin: [n 3] or [1 3] for rays that share it.
         direction: [n 3], any length.
-        time_s: Seconds, for what sways.
+        time_s: Seconds, for sway.
         footprint: Angle between neighbouring pixels, in rad.
 
     Returns:
@@ -82,7 +82,7 @@ def trace(surfaces, origin, direction, time_s, footprint):
 @njit(cache=True, fastmath=True, nogil=True)
 @no_type_check
 def meet(surfaces, origin, direction, time_s, footprint):
-    """Which surface each ray meets, the first that covers half of it, and where.
+    """The first surface that covers half of each ray, and its depth.
 
     The arguments are those of `trace`.
 
@@ -102,7 +102,7 @@ def meet(surfaces, origin, direction, time_s, footprint):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _swayed(surfaces, time_s):
-    """The table of shapes with what sways where it is now."""
+    """The table of shapes with their sway at a time."""
     shape = surfaces.shape.copy()
     for i in range(len(shape)):
         swing = sin(6.283185307179586 * time_s / surfaces.sway[i, 3])
@@ -113,7 +113,7 @@ def _swayed(surfaces, time_s):
 @njit(cache=True, fastmath=True, inline="always")
 @no_type_check
 def _unit_ray(origin, direction, r):
-    """Position and unit direction of a ray, and how long its direction was."""
+    """Position and unit direction of a ray, and the length of its direction."""
     o = r if len(origin) > 1 else 0
     x, y, z = direction[r, 0], direction[r, 1], direction[r, 2]
     length = sqrt(x * x + y * y + z * z)
@@ -179,7 +179,7 @@ def _within(shape, i, ray):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _meet(shape, i, ray, footprint):
-    """Distance along a unit ray to a surface, and the share of the ray that it covers."""
+    """Distance along a unit ray to a surface, and the fraction of the ray that it covers."""
     half = (shape[i, 4], shape[i, 5], shape[i, 6])
     x, y, z = shape[i, 1] - ray[0], shape[i, 2] - ray[1], shape[i, 3] - ray[2]
     along = x * ray[3] + y * ray[4] + z * ray[5]
@@ -230,7 +230,7 @@ def _slabs(half, x, y, z, dx, dy, dz):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _meet_cylinder(half, x, y, z, dx, dy, dz, footprint):
-    """Distance along a ray in a cylinder's axes, and the share of the ray that it covers."""
+    """Distance along a ray in a cylinder's axes, and the fraction of the ray that it covers."""
     radius, height = half[0], half[1]
     flat = max(dx * dx + dz * dz, 1e-12)
     along = -(x * dx + z * dz) / flat  # where the ray is nearest to the axis
@@ -257,7 +257,7 @@ def _meet_cylinder(half, x, y, z, dx, dy, dz, footprint):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _colour(surfaces, shape, i, ray, t, footprint):
-    """Linear rgb that a surface sends from where the ray meets it."""
+    """Linear rgb of a surface at its intersection with a ray."""
     nx, ny, nz, u, v, x, y, facing = _surface_point(shape, i, ray, t)
     look = surfaces.look
     texture, width = int(look[i, 9]), footprint * t
@@ -291,7 +291,7 @@ def _colour(surfaces, shape, i, ray, t, footprint):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _surface_point(shape, i, ray, t):
-    """Normal in the surface's axes; place on its texture; x, y in its axes; cosine to the ray."""
+    """Normal in the surface's axes; texture coordinates; x, y in its axes; cosine to the ray."""
     x, y, z, dx, dy, dz = _within(shape, i, ray)
     x, y, z = x + t * dx, y + t * dy, z + t * dz
     nx, ny, nz, u, v = 0.0, 0.0, -1.0 if dz > 0 else 1.0, x, y
@@ -320,7 +320,7 @@ def _surface_point(shape, i, ray, t):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def _sunlight(shape, light, i, place, normal):
-    """Cosine towards the sun, less what other surfaces hide of it."""
+    """Cosine towards the sun, times the fraction of the sun that is not occluded."""
     cosine = light[0] * normal[0] + light[1] * normal[1] + light[2] * normal[2]
     if cosine <= 0.0:
         return 0.0

@@ -1,9 +1,9 @@
-"""Closed-form textures that know how wide a pixel is.
+"""Closed-form textures, antialiased for the width of a pixel.
 
-A texture says, at a place (u, v) on a surface, how much of a second colour (`ink`) and of a third
-(`accent`) covers the first. Every edge is as soft as the footprint of a pixel and patterns finer
-than a pixel fade to their mean, so images have no aliasing, and light stays a smooth function
-of the ray, however small the image.
+A texture gives, at coordinates (u, v) on a surface, how much of a second colour (`ink`) and of a
+third (`accent`) covers the first. Every edge is as soft as the footprint of a pixel, and patterns
+finer than a pixel fade to their mean, so images have no aliasing, and light is a smooth function of
+the ray, however small the image.
 
 Everything here is compiled and called once per ray; lengths are world units. It is compiled into
 `surfaces.trace`, whose cache does not notice a change in this file: run `make clean` after one.
@@ -23,7 +23,7 @@ SOLID, CHECKS, STRIPES, TILES, BRICKS, LEAVES, MARBLE, WOOD, TEXT = range(9)
 PAGE = 320
 """Longest side of a page of text, in samples."""
 PAGE_INK = 0.22
-"""Share of a page that letters cover, about; what text fades to when a pixel is too wide."""
+"""Approximate fraction of a page that letters cover; text fades to it when a pixel is too wide."""
 
 
 def page(text: str, aspect: float) -> Float32[np.ndarray, "h w"]:
@@ -62,21 +62,21 @@ def soft(distance, width):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def band(distance, half, width):
-    """Share of a pixel that a line covers, however thin; `distance` is from its middle."""
+    """Fraction of a pixel that a line covers, however thin; `distance` is from its middle."""
     return soft(half - distance, width) - soft(-half - distance, width)
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
 def kept(width, period):
-    """How much contrast survives when a pixel of `width` looks at a pattern of this period."""
+    """Contrast of a pattern of this period that remains for a pixel of `width`."""
     return 1.0 - min(max((width / period - 0.35) / 0.4, 0.0), 1.0)
 
 
 @njit(cache=True, fastmath=True)
 @no_type_check
 def paint(kind, u, v, width, scale, seed, slant):
-    """Shares of ink and accent at (u, v).
+    """Fractions of ink and accent at (u, v).
 
     Args:
         kind: One of the textures.
@@ -113,7 +113,7 @@ def paint(kind, u, v, width, scale, seed, slant):
 @njit(cache=True, fastmath=True)
 @no_type_check
 def letters(distances, u, v, width):
-    """Share of ink on a page.
+    """Fraction of ink on a page.
 
     Args:
         distances: The page.
