@@ -121,8 +121,8 @@ def undistorted_pixels(camera: Camera) -> Float32[np.ndarray, "h w 2"]:
 
     10.0 is the centre of undistorted pixel 10, as `core.events` has it for rectified events.
     """
-    direction = camera.direction(camera.grid().double())
-    plane = (direction[..., :2] / direction[..., 2:]).numpy()
+    direction = camera.direction(camera.grid().double())  # [h w 3]
+    plane = (direction[..., :2] / direction[..., 2:]).numpy()  # [h w 2]
     scale = np.array([camera.fx_px, camera.fy_px])
     centre = np.array([camera.cx_px, camera.cy_px]) - HALF_PIXEL
     return (plane * scale + centre).astype(np.float32)
@@ -139,10 +139,10 @@ def resampling_map(
         real_from_ideal: Rotation of directions from the ideal camera's axes to the real one's.
             Where the cameras have different centres, this is exact for points at infinity only.
     """
-    direction = ideal.direction(ideal.grid().double())
+    direction = ideal.direction(ideal.grid().double())  # [h w 3]
     if real_from_ideal is not None:
         direction = direction @ torch.from_numpy(real_from_ideal).T
-    behind = direction[..., 2] <= 0
+    behind = direction[..., 2] <= 0  # [h w]
     xy = real.project(torch.where(behind[..., None], torch.ones_like(direction), direction))
     xy[behind] = -1e4
     return (xy - HALF_PIXEL).float().numpy()

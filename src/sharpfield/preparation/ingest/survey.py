@@ -100,7 +100,7 @@ def hot_pixels(
         return np.empty((0, 2), np.int64)
     rows, columns = np.nonzero(events_per_pixel >= MIN_EVENTS)
     found = _stands_out(events_per_pixel, rows, columns, times)
-    return np.stack([columns[found], rows[found]], -1)
+    return np.stack([columns[found], rows[found]], -1)  # [n 2]
 
 
 @dataclass

@@ -143,7 +143,7 @@ def _records(layout: Layout) -> Iterator[tuple[UInt32[np.ndarray, "n"], Int64[np
     for block in read_blocks(layout.path, layout.begin):
         data = rest + block
         whole = len(data) // 8 * 8
-        records = np.frombuffer(data[:whole], ">u4").reshape(-1, 2).astype(np.uint32)
+        records = np.frombuffer(data[:whole], ">u4").reshape(-1, 2).astype(np.uint32)  # [n 2]
         rest = data[whole:]
         if len(records):
             t_us = _unwrapped(records[:, 1], before)

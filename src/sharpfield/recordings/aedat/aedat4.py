@@ -294,7 +294,7 @@ def _raw_chunks(layout: Layout, number: int) -> Iterator[RawChunk]:
             layout.log.note("damaged packets")
             continue
         words = np.require(np.frombuffer(stored, np.int64), requirements="A")
-        yield RawChunk(*_columns(words.reshape(-1, 2)))
+        yield RawChunk(*_columns(words.reshape(-1, 2)))  # [n 2]: time; x, y, polarity
 
 
 def _frames(layout: Layout, number: int) -> Iterator[Frame]:

@@ -224,7 +224,7 @@ def decode_libcaer(encoding: str, payload: memoryview, base_ns: int) -> RawChunk
         words = np.frombuffer(payload, "<u2", len(payload) // 2)
         *columns, count = _decode_libcaer_cmp(words, base_ns, _max_events(words))
         return RawChunk(*columns)[:count]
-    words = np.frombuffer(payload, "<u4", len(payload) // 8 * 2).reshape(-1, 2)
+    words = np.frombuffer(payload, "<u4", len(payload) // 8 * 2).reshape(-1, 2)  # [n 2]
     return RawChunk(*(_decode_libcaer if encoding == "libcaer" else _decode_mono)(words, base_ns))
 
 

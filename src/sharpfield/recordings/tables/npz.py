@@ -263,7 +263,7 @@ def open_nmnist(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Record
             rest += block
             records = np.frombuffer(rest, np.uint8, len(rest) // RECORD * RECORD)
             rest = rest[len(records) :]
-            x, y, high, middle, low = records.reshape(-1, RECORD).T.astype(np.int64)
+            x, y, high, middle, low = records.reshape(-1, RECORD).T.astype(np.int64)  # [5 n]
             pauses = np.cumsum(y == NO_ROW) * PAUSE_US + paused_us
             paused_us = int(pauses[-1]) if len(pauses) else paused_us
             t_us = ((high & 0x7F) << 16 | middle << 8 | low) + pauses
