@@ -19,10 +19,15 @@ from typing import Any
 import pytest
 
 import sharpfield
+from sharpfield.captures.read import LAYOUTS
 from sharpfield.cli import commands as command_line
+from sharpfield.core.lenses import LENSES
+from sharpfield.metrics.registry import METRICS
 from sharpfield.recipes import RECIPES, recipe_named
 from sharpfield.recipes.settings.options import changed, options_of
 from sharpfield.recipes.settings.presets import presets_of
+from sharpfield.recordings.open import FORMATS
+from sharpfield.simulation.sensors.event_pixels import SENSORS
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "sharpfield"
@@ -40,6 +45,7 @@ FOLDER = re.compile(r"[a-z_]+(?:/[a-z_]+)*/")
 DOTTED = re.compile(r"([a-z_]+)((?:\.\w+)+)")
 PROGRAM = re.compile(r"python (?:-m ([\w.]+)|([\w/]+\.py))(.*)")
 FLAG = re.compile(r"--([a-z][\w.-]*)")
+ERROR = re.compile(r"^(?:Capture|Option|Run|Shape)Error: (.*)$", re.MULTILINE)
 ARGUMENT = re.compile(r"add_argument\(\s*\"--([\w-]+)\"")
 LINK = re.compile(r"\]\(([^)\s]+)\)|<img[^>]* src=\"([^\"]+)\"")
 COMMAND = re.compile(r"^(sharpfield [a-z].*)$", re.MULTILINE)
@@ -313,6 +319,22 @@ def test_quoted_programs_exist(page: Path) -> None:
         assert path.exists(), f"{name(page)}: {module or file}"
         given = {flag.replace("-", "_") for flag in FLAG.findall(rest.partition("`")[0])}
         assert given <= arguments_of(path), f"{name(page)}: {module or file}{rest}"
+
+
+def test_nothing_that_can_be_chosen_is_left_out() -> None:
+    """Every command, recipe, layout, format, sensor, metric and lens is on a page."""
+    text = "".join(page.read_text() for page in PAGES if page.name != "api.md")
+    registries = (command_line.COMMANDS, RECIPES, LAYOUTS, FORMATS, SENSORS, METRICS, LENSES)
+    names = {name for registry in registries for name in registry} - {"pinhole"}
+    assert not (missing := {name for name in names if f"`{name}`" not in text}), missing
+
+
+def test_quoted_errors_are_as_they_are_raised() -> None:
+    code = "".join(file.read_text() for file in SOURCE.rglob("*.py"))
+    for page in PAGES:
+        for text in ERROR.findall(page.read_text()):
+            pattern = re.escape(text).replace("poses", r"(poses|\{known\})")
+            assert re.search(pattern, code), f"{name(page)}: {text}"
 
 
 def test_files_and_names_that_are_missing_are_noticed(tmp_path: Path) -> None:
