@@ -72,7 +72,7 @@ def test_every_recipe_learns_from_whatever_there_is(case: str):
     assert loss() < 0.9 * before
 
 
-def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
+def test_the_edi_phase_renders_single_instants_and_later_steps_exposures():
     model = small().build(blurred(), 0)
     late_from = model.heaviest_step
     early, late = model.draw(late_from - 1), model.draw(late_from)
@@ -86,7 +86,7 @@ def test_early_steps_look_at_single_instants_and_late_ones_at_exposures():
     assert set(model.losses(late, STEPS - 1)) == {"blur", "latent", "events"}, "growing has ended"
 
 
-def test_sharp_frames_are_carried_to_both_ends_of_any_stretch():
+def test_of_sharp_frames_pairs_of_latent_frames_are_compared():
     model = small().build(tiny_moving(), 0)
     lengths = set()
     for step in range(model.heaviest_step, STEPS):
@@ -122,7 +122,7 @@ def test_counts_are_those_of_the_camera():
         assert np.abs(seen.positive[camera, 0, ..., 0].numpy() - counts).max() <= 1
 
 
-def test_what_stands_still_learns_alone_at_first():
+def test_static_gaussians_learn_alone_at_first():
     model = small().build(tiny_moving(), 0)
     pose = model.path.pose(torch.full((1, 1), 0.5), torch.zeros(1, 1, dtype=torch.int64))
     corner = torch.zeros(1, 1, 2, dtype=torch.int64)

@@ -75,7 +75,7 @@ def small(name: str, **changes: Any) -> Any:
 
 
 def learned(model: SplatModel) -> tuple[float, float]:
-    """The loss of the last steps' looks, before and after training."""
+    """The loss of the last steps' batches, before and after training."""
     steps = model.steps
     probe = [(step, model.draw(step)) for step in range(steps - 4, steps)]
 
@@ -133,7 +133,7 @@ def test_everything_unknown_is_learned_at_once() -> None:
         assert torch.isfinite(parameter).all() and parameter.any(), name
 
 
-def test_early_steps_look_at_single_instants_and_late_ones_at_exposures() -> None:
+def test_the_edi_phase_renders_single_instants_and_later_steps_exposures() -> None:
     model = small("ev-splat", sampling=SamplingOptions(edi_phase=0.5, grad_views=3)).build(
         recorded(), 0
     )
@@ -192,7 +192,7 @@ def test_a_blurred_frame_is_the_mean_of_all_views_with_the_gradient_of_a_few() -
         assert one.any()
 
 
-def test_the_baselines_differ_in_what_they_believe_of_the_frames() -> None:
+def test_the_baselines_differ_in_how_they_model_frames() -> None:
     plain, edi, blur = (small(name).build(recorded(), 0) for name in NAMES[:3])
     one, other = (model.draw(0)["frames"] for model in (plain, edi))
     assert torch.equal(one.frame, other.frame) and not torch.equal(one.value, other.value)
@@ -200,7 +200,7 @@ def test_the_baselines_differ_in_what_they_believe_of_the_frames() -> None:
     assert blur.draw(0)["views"].shape[1] > 1 and "events" not in blur.draw(0)
 
 
-def test_event_splat_never_looks_at_frames() -> None:
+def test_event_splat_never_uses_frames() -> None:
     both, alone = (
         small("event-splat").build(capture, 0)
         for capture in (recorded(), recorded().without(frames=True))
@@ -320,7 +320,7 @@ def test_the_recipes_are_listed_and_described() -> None:
 def test_a_step_depends_on_seed_and_step_alone() -> None:
     recipe = small("ev-splat", calibration=LearnedCalibrationOptions(gains=True, knots=4))
     first, second = recipe.build(recorded(), 5), recipe.build(recorded(), 5)
-    first.losses(first.draw(3), 3)  # what was looked at before does not matter
+    first.losses(first.draw(3), 3)  # what was sampled before does not matter
     for step in (2, 20):
         one, other = (model.losses(model.draw(step), step) for model in (first, second))
         assert one.keys() == other.keys()
