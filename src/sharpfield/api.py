@@ -13,8 +13,7 @@ from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.preparation.deblurring import Deblurred, deblur_to
-from sharpfield.preparation.deblurring import deblur as deblur_capture
+from sharpfield.preparation.deblurring import Deblurred, deblur_frames, deblur_to
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.recipes import recipe_named
 from sharpfield.recipes.settings.options import with_options
@@ -257,7 +256,7 @@ def deblur(
     expect_capture(capture)
     options = DeblurOptions(threshold, method, instants)
     return (
-        deblur_capture(capture, options) if out is None else deblur_to(capture, Path(out), options)
+        deblur_frames(capture, options) if out is None else deblur_to(capture, Path(out), options)
     )
 
 

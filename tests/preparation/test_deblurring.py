@@ -14,7 +14,7 @@ from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure
 from sharpfield.events.motion import EventMotion
-from sharpfield.preparation.deblurring import deblur, deblur_to
+from sharpfield.preparation.deblurring import deblur_frames, deblur_to
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.preparation.thresholds import find_thresholds
 from sharpfield.simulation.sensors.event_pixels import EventSensor
@@ -40,7 +40,7 @@ def error(images: np.ndarray, truth: np.ndarray) -> float:
 @pytest.mark.parametrize("method", ["exact", "joint"])
 def test_images_come_nearer_to_the_truth(method: str) -> None:
     held = capture().needed_frames
-    made = deblur(capture(), DeblurOptions(method=method, threshold=THRESHOLD))
+    made = deblur_frames(capture(), DeblurOptions(method=method, threshold=THRESHOLD))
     assert made.images.shape == (3, 1, 48, 72, 3) and made.images.dtype == np.uint8
     after = error(made.images[:, 0], held.truth[made.frame])
     assert after < 0.5 * error(held.images[made.frame], held.truth[made.frame])
@@ -51,7 +51,9 @@ def test_light_is_where_the_integral_holds() -> None:
     held = capture().needed_frames
     errors = {
         method: error(
-            deblur(capture(), DeblurOptions(method=method, threshold=THRESHOLD)).images[:, 0],
+            deblur_frames(capture(), DeblurOptions(method=method, threshold=THRESHOLD)).images[
+                :, 0
+            ],
             held.truth,
         )
         for method in ("exact", "published")
@@ -61,15 +63,15 @@ def test_light_is_where_the_integral_holds() -> None:
 
 def test_known_thresholds_are_used_and_others_found() -> None:
     noted = replace(capture(), known=Known(thresholds=Thresholds(0.3, 0.4)))
-    known = deblur(noted, DeblurOptions()).found
+    known = deblur_frames(noted, DeblurOptions()).found
     assert (known.thresholds.negative, known.thresholds.positive, known.source) == (
         0.3,
         0.4,
         "known",
     )
-    given = deblur(noted, DeblurOptions(threshold=0.17)).found
+    given = deblur_frames(noted, DeblurOptions(threshold=0.17)).found
     assert (given.thresholds.negative, given.source) == (0.17, "given")
-    silent = deblur(replace(capture(), known=Known()), DeblurOptions()).found
+    silent = deblur_frames(replace(capture(), known=Known()), DeblurOptions()).found
     assert silent.source == "disagreement"
     assert silent.thresholds.negative == pytest.approx(THRESHOLD, rel=0.15)
     assert silent.thresholds.positive == pytest.approx(THRESHOLD, rel=0.15)
@@ -90,11 +92,11 @@ def test_single_frame_leaves_the_density_of_edges() -> None:
 
 def test_several_instants_are_centred_in_equal_parts() -> None:
     exposure = capture().needed_frames.exposure
-    made = deblur(capture(), DeblurOptions(instants=5, threshold=THRESHOLD))
+    made = deblur_frames(capture(), DeblurOptions(instants=5, threshold=THRESHOLD))
     expected = exposure.open_us[0] + 50_000 * (np.arange(5) + 0.5) / 5
     assert made.images.shape[1] == 5
     np.testing.assert_array_equal(made.instants_us[0], expected)
-    once = deblur(capture(), DeblurOptions(threshold=THRESHOLD))
+    once = deblur_frames(capture(), DeblurOptions(threshold=THRESHOLD))
     np.testing.assert_array_equal(made.images[:, 2], once.images[:, 0])
 
 
@@ -107,7 +109,7 @@ def test_only_frames_to_learn_from_that_are_blurred_are_deblurred() -> None:
         frames=replace(held, exposure=Exposure(opens, closes)),
         split=Split(np.array([1, 2]), np.array([0])),
     )
-    assert deblur(some, DeblurOptions(threshold=THRESHOLD)).frame.tolist() == [2]
+    assert deblur_frames(some, DeblurOptions(threshold=THRESHOLD)).frame.tolist() == [2]
 
 
 def test_colour_events_move_each_colour_by_itself() -> None:
@@ -117,7 +119,7 @@ def test_colour_events_move_each_colour_by_itself() -> None:
         "garden", "glide", rig=Rig(size=(72, 48), event_sensor=sensor), timing=timing, seed=1
     )
     held = coloured.needed_frames
-    made = deblur(coloured, DeblurOptions(threshold=THRESHOLD))
+    made = deblur_frames(coloured, DeblurOptions(threshold=THRESHOLD))
     before, after = error(held.images, held.truth), error(made.images[:, 0], held.truth)
     assert after < before
 
@@ -145,21 +147,21 @@ def test_grey_frames_and_rectified_events() -> None:
     both = replace(
         capture(), frames=replace(held, images=images, truth=None, truth_known=None), events=moved
     )
-    made = deblur(both, DeblurOptions(threshold=THRESHOLD))
-    coloured = deblur(capture(), DeblurOptions(threshold=THRESHOLD))
+    made = deblur_frames(both, DeblurOptions(threshold=THRESHOLD))
+    coloured = deblur_frames(capture(), DeblurOptions(threshold=THRESHOLD))
     weights = np.array([0.299, 0.587, 0.114])
     assert np.abs(made.images[..., 0] - coloured.images @ weights).mean() < 3
 
 
 def test_capture_without_events_is_refused() -> None:
     with pytest.raises(CaptureError, match="this needs events, and the capture has none"):
-        deblur(capture().without(events=True), DeblurOptions())
+        deblur_frames(capture().without(events=True), DeblurOptions())
 
 
 def test_events_of_another_size_are_refused() -> None:
     other = replace(capture().needed_events, width=80)
     with pytest.raises(CaptureError, match="events 80x48, frames 72x48"):
-        deblur(replace(capture(), events=other), DeblurOptions())
+        deblur_frames(replace(capture(), events=other), DeblurOptions())
 
 
 def test_sharp_frames_alone_are_refused() -> None:
@@ -167,7 +169,7 @@ def test_sharp_frames_alone_are_refused() -> None:
     middle = held.exposure.middle_us
     sharp = replace(capture(), frames=replace(held, exposure=Exposure(middle, middle)))
     with pytest.raises(CaptureError, match="no frame to deblur has an exposure"):
-        deblur(sharp, DeblurOptions())
+        deblur_frames(sharp, DeblurOptions())
 
 
 def test_several_instants_need_the_exact_method() -> None:

@@ -24,7 +24,7 @@ from sharpfield.preparation.poses.external import Mount, attach, known_at
 from sharpfield.preparation.poses.find import PosesFound, find_poses
 from sharpfield.preparation.poses.images import sfm_images
 from sharpfield.preparation.poses.path import extrapolated
-from sharpfield.preparation.poses.report import as_text, summary
+from sharpfield.preparation.poses.report import poses_summary, poses_text
 from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
@@ -99,12 +99,12 @@ def test_the_capture_survives_the_disk_and_the_report_says_what_happened(tmp_pat
     native.write(found().capture, tmp_path / "posed")
     again = read_capture(tmp_path / "posed")
     np.testing.assert_array_equal(again.points, found().capture.points)
-    about = summary(unposed(fast()), found())
+    about = poses_summary(unposed(fast()), found())
     assert json.loads(json.dumps(about))["registered"] == 21
-    assert "21 of 21 images have a pose" in as_text(about)
-    assert not about["relief"]["flat"] and "nearly flat" not in as_text(about)
+    assert "21 of 21 images have a pose" in poses_text(about)
+    assert not about["relief"]["flat"] and "nearly flat" not in poses_text(about)
     flat = about | {"relief": {"flat": True, "why": "it is nearly flat", "do": "look elsewhere"}}
-    assert "warning: it is nearly flat\n  do     look elsewhere" in as_text(flat)
+    assert "warning: it is nearly flat\n  do     look elsewhere" in poses_text(flat)
 
 
 def test_known_positions_give_the_world() -> None:

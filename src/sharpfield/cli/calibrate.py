@@ -29,13 +29,13 @@ def calibrate_command(
     from sharpfield.captures.read import read_capture
     from sharpfield.core.capture import Thresholds
     from sharpfield.preparation.calibrate.measure import calibrate as measure
-    from sharpfield.preparation.calibrate.report import IMAGE, as_text, write_calibration
+    from sharpfield.preparation.calibrate.report import IMAGE, calibration_text, write_calibration
 
     held = read_capture(capture, poses=False)
     made = measure(held, options)
     about = write_calibration(held, made, out)
     console = screen()
-    console.print(as_text(about), soft_wrap=True)
+    console.print(calibration_text(about), soft_wrap=True)
     console.print(f"Numbers and a map of the pixels are in {out}; see {out / IMAGE}")
     if write_capture is not None:
         measured = Thresholds(made.negative, made.positive, "estimated")

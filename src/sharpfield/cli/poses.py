@@ -75,7 +75,7 @@ def poses_command(
     from sharpfield.captures.read import read_capture
     from sharpfield.preparation.poses.external import known_at
     from sharpfield.preparation.poses.find import find_poses
-    from sharpfield.preparation.poses.report import as_text, summary, write_poses_page
+    from sharpfield.preparation.poses.report import poses_summary, poses_text, write_poses_page
     from sharpfield.storage.arrays import expect_replaceable
 
     expect_replaceable(out, native.recognise)
@@ -89,11 +89,11 @@ def poses_command(
         known = partial(known_at, read_path(elsewhere.align, elsewhere.layout), mount)
     found = find_poses(original, options, known=known)
     native.write(replace(found.capture, name=out.name), out)
-    about = summary(original, found)
+    about = poses_summary(original, found)
     write_json(out / REPORT, about)
     write_poses_page(out / PAGE, original, found, about)
     console = screen()
-    console.print(as_text(about), soft_wrap=True)
+    console.print(poses_text(about), soft_wrap=True)
     console.print(f"The capture with poses is in {out}; open {out / PAGE}", soft_wrap=True)
 
 

@@ -37,7 +37,7 @@ LENGTHS = (1 / 32, 1 / 128)
 MOST_COUNT = 20.0
 """Counts are clipped to this where the range of a metric is fixed."""
 
-Scores = dict[str, float]
+EventScores = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -172,9 +172,9 @@ def score_events(
     pairs: dict[float, list[tuple[Tensor, Tensor]]] = {length: [] for length in lengths}
     for track in np.unique(np.asarray(capture.test_events.track)).tolist():
         for start in (np.arange(windows) + 0.5) / windows * (1 - max(lengths)):
-            first = log_intensity(model, int(track), float(start))
+            first = render_log_intensity(model, int(track), float(start))
             for length in lengths:
-                change = log_intensity(model, int(track), float(start + length)) - first
+                change = render_log_intensity(model, int(track), float(start + length)) - first
                 counts = count_recorded(capture, index, int(track), (start, start + length))
                 pairs[length].append((change, counts))
     return {
@@ -183,7 +183,7 @@ def score_events(
     }
 
 
-def log_intensity(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
+def render_log_intensity(model: Model, track: int, time: float) -> Float[Tensor, "h w"]:
     """Log intensity that a camera sees at a time, as the response of the model gives it.
 
     A model without a response of its own gets the logarithm of luma above the floor of `formation`.
@@ -217,7 +217,7 @@ def mean_threshold(capture: Capture) -> float:
     return sum(thresholds_of(capture)) / 2
 
 
-def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> Scores:
+def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> EventScores:
     """Means over event frames, each a predicted change `[h w]` and recorded counts `[2 h w]`."""
     off, on = thresholds_of(capture)
     recorded = torch.stack([on * counts[1] - off * counts[0] for _, counts in pairs])  # [n, h, w]

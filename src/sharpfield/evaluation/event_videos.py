@@ -19,10 +19,10 @@ from sharpfield.core.protocols import Model
 from sharpfield.evaluation.event_scores import (
     EVENT_METRICS,
     count_recorded,
-    log_intensity,
     mean_threshold,
+    render_log_intensity,
 )
-from sharpfield.report.colormaps import colour_signs, side_by_side
+from sharpfield.report.colormaps import Rgb, colour_signs, side_by_side
 from sharpfield.report.event_frames import full_count
 from sharpfield.report.tables import TextTable
 from sharpfield.report.video import write_video
@@ -38,8 +38,6 @@ HEIGHT_PX = 240
 """Smaller images are enlarged by a whole factor up to this height."""
 GAP_PX = 4
 """Gap between the two images."""
-
-Rgb = UInt8[np.ndarray, "height width 3"]
 
 
 def write_event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
@@ -96,7 +94,7 @@ def _images(model: Model, capture: Capture, track: int) -> list[Rgb]:
     assert capture.test_events is not None
     index = event_index(capture.test_events)
     ends = np.linspace(0, 1, WINDOWS + 1)
-    log_images = [log_intensity(model, track, float(time)) for time in ends]
+    log_images = [render_log_intensity(model, track, float(time)) for time in ends]
     predicted = [
         ((after - before) / mean_threshold(capture)).trunc().numpy()
         for before, after in zip(log_images, log_images[1:], strict=False)

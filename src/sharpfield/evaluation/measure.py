@@ -32,7 +32,7 @@ from sharpfield.evaluation.alignment_and_depth import (
 from sharpfield.evaluation.brightness import Brightness
 from sharpfield.evaluation.event_scores import score_events
 from sharpfield.evaluation.event_videos import write_event_videos
-from sharpfield.evaluation.protocol import describe
+from sharpfield.evaluation.protocol import describe_protocol
 from sharpfield.evaluation.refine import training_pose_errors
 from sharpfield.evaluation.scores import mean, score, view_metrics
 from sharpfield.evaluation.views import (
@@ -127,7 +127,7 @@ def evaluate(
     events = score_events(model, capture)
     metrics: dict[str, Any] = {
         "protocol": {
-            **describe(capture, test, lpips, too_small=too_small),
+            **describe_protocol(capture, test, lpips, too_small=too_small),
             "alignment": brightness.stated(),
             "compared_as": "luma" if brightness.grey else "all channels",
             **options.stated,

@@ -63,7 +63,7 @@ def camera_path(capture: Capture, path: str, *, images: int = 60) -> RenderPath:
         raise OptionError("a path needs at least one image", got=images)
     kind, _, argument = path.partition(":")
     if kind == "exposure" and argument.isdecimal():
-        return exposure_path(capture, int(argument), images)
+        return path_in_exposure(capture, int(argument), images)
     makers: dict[str, Callable[[Capture, int], RenderPath]] = {
         "spiral": spiral_path,
         "train": recorded_path,
@@ -104,7 +104,7 @@ def recorded_path(capture: Capture, images: int) -> RenderPath:
     return RenderPath(made.numpy(), time)
 
 
-def exposure_path(capture: Capture, frame: int, images: int) -> RenderPath:
+def path_in_exposure(capture: Capture, frame: int, images: int) -> RenderPath:
     """Through the exposure of one frame, both ends included.
 
     Raises:

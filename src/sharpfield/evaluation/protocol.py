@@ -22,7 +22,7 @@ ENABLE_LPIPS = (
 )
 
 
-def describe(
+def describe_protocol(
     capture: Capture, test: Sequence[Reference], lpips: Lpips | None, *, too_small: bool = False
 ) -> dict[str, Any]:
     """The part of the protocol that depends on the capture and on the definitions.

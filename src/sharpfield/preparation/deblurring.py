@@ -47,7 +47,7 @@ class Deblurred:
     """Thresholds that were used."""
 
 
-def deblur(capture: Capture, options: DeblurOptions) -> Deblurred:
+def deblur_frames(capture: Capture, options: DeblurOptions) -> Deblurred:
     """Sharp images of the training frames, or of all blurred frames if there are none.
 
     Raises:
@@ -155,19 +155,19 @@ def deblur_to(capture: Capture, out: Path, options: DeblurOptions) -> Deblurred:
     A frame's image has its name; several of one exposure have `_0`, `_1`, ... appended.
 
     Raises:
-        CaptureError: See `deblur`.
+        CaptureError: See `deblur_frames`.
     """
-    made = deblur(capture, options)
+    made = deblur_frames(capture, options)
     out.mkdir(parents=True, exist_ok=True)
     for names, images in zip(_names(capture, made), made.images, strict=True):
         for name, image in zip(names, images, strict=True):
             write_image(out / name, image)
     write_image(out / "contact.png", contact_sheet(capture, made))
-    write_json(out / "deblur.json", summary(capture, made))
+    write_json(out / "deblur.json", deblur_summary(capture, made))
     return made
 
 
-def summary(capture: Capture, made: Deblurred) -> dict[str, object]:
+def deblur_summary(capture: Capture, made: Deblurred) -> dict[str, object]:
     """Thresholds, times and metrics as plain values for JSON.
 
     Metrics are given for the blurred frame and for the image nearest to the middle of its exposure:

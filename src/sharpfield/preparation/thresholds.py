@@ -28,7 +28,7 @@ PAIRS = 4
 DARK, BRIGHT = 0.01, 0.9
 """Range of linear light in which pixel values are reliable."""
 
-Source = Literal["given", "known", "disagreement", "edge density"]
+ThresholdSource = Literal["given", "known", "disagreement", "edge density"]
 """Given by an option, stated by the capture, or found by minimising one of two costs."""
 
 
@@ -37,7 +37,7 @@ class FoundThresholds:
     """Thresholds, and where they come from."""
 
     thresholds: FixedThresholds
-    source: Source
+    source: ThresholdSource
     cost: float | None = None
     """Value of the minimised cost; see `events.threshold_search`."""
 
@@ -58,7 +58,7 @@ def find_thresholds(capture: Capture, motion: EventMotion) -> FoundThresholds:
         CaptureError: There are no frames, or no events.
     """
     blurred = np.flatnonzero(~capture.needed_frames.exposure.instant)
-    pairs = neighbours(capture, blurred)
+    pairs = consecutive_pairs(capture, blurred)
     if len(pairs):
         chosen = evenly_spread(pairs, PAIRS)
         costs = [_PairCost.of(capture, motion, pair) for pair in chosen]
@@ -77,7 +77,7 @@ def linear_light(capture: Capture, frame: int, tone: Tone) -> Float[Tensor, "h w
     return tone.decode(stored)
 
 
-def neighbours(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
+def consecutive_pairs(capture: Capture, frames: Int64[np.ndarray, "a"]) -> Int64[np.ndarray, "m 2"]:
     """Pairs of consecutive frames of one track."""
     all_frames = capture.needed_frames
     order = frames[np.lexsort((all_frames.exposure.open_us[frames], all_frames.track[frames]))]

@@ -35,7 +35,7 @@ PUBLISHED_SHARE = 0.3
 FPS = 20.0
 """Windows per second of the video."""
 
-Append = Callable[[Int32[np.ndarray, "h w 2"]], None]
+AppendCounts = Callable[[Int32[np.ndarray, "h w 2"]], None]
 """Appends the counts of the next window."""
 
 
@@ -74,7 +74,9 @@ def windows(start_us: int, end_us: int, length_us: int) -> list[int]:
 
 
 @contextmanager
-def writing_frames(folder: Path, number: int, *, least_share: float = 0.0) -> Iterator[Append]:
+def writing_frames(
+    folder: Path, number: int, *, least_share: float = 0.0
+) -> Iterator[AppendCounts]:
     """Gives a function that appends the counts of a window.
 
     The folder appears complete, at the end, or not at all. Only one frame is in memory: arrays are

@@ -11,7 +11,7 @@ from sharpfield.captures.native import layout as native
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.evaluation.tables import methods_table
-from sharpfield.preparation.deblurring import deblur
+from sharpfield.preparation.deblurring import deblur_frames
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.report.tables import markdown
@@ -79,7 +79,7 @@ def run_demo(
 
 def with_deblurred_frames(capture: Capture) -> Capture:
     """The capture with its blurry training frames replaced by sharp ones from events (EDI)."""
-    made = deblur(capture, DeblurOptions())
+    made = deblur_frames(capture, DeblurOptions())
     frames = capture.needed_frames
     images = np.array(frames.images)
     images[made.frame] = made.images[:, 0]

@@ -10,7 +10,7 @@ import pytest
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.preparation.calibrate.measure import ThresholdCalibration, calibrate
-from sharpfield.preparation.calibrate.report import as_text, write_calibration
+from sharpfield.preparation.calibrate.report import calibration_text, write_calibration
 from sharpfield.preparation.options import CalibrateOptions
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
@@ -91,7 +91,7 @@ def test_files_say_what_was_measured(tmp_path: Path) -> None:
     arrays = load_arrays(tmp_path / "out" / "pixels.npz")
     assert arrays["ratio"].shape == (64, 96) and arrays["dead"].dtype == bool
     assert (tmp_path / "out" / "pixels.png").stat().st_size > 500
-    assert "stated in the capture: 0.25" in as_text(about)
+    assert "stated in the capture: 0.25" in calibration_text(about)
 
 
 def test_a_scene_that_stands_still_is_refused() -> None:

@@ -18,7 +18,7 @@ from sharpfield.geometry.trajectory import Stamped
 from sharpfield.preparation.doctor.checkup import examine, examine_path
 from sharpfield.preparation.doctor.events import check_light, odd_pixels
 from sharpfield.preparation.doctor.findings import Checkup
-from sharpfield.preparation.poses.path import frames_of
+from sharpfield.preparation.poses.path import frames_on_tracks
 from sharpfield.simulation.sensors.event_pixels import SENSORS
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
@@ -37,7 +37,7 @@ def nanoseconds(capture: Capture) -> Capture:
 
 def frames_late(capture: Capture) -> Capture:
     kept = np.arange(len(capture.needed_frames) - 1)
-    frames = frames_of(capture.needed_frames, kept, capture.needed_frames.track[kept])
+    frames = frames_on_tracks(capture.needed_frames, kept, capture.needed_frames.track[kept])
     late = Exposure(frames.exposure.open_us + 20_000, frames.exposure.close_us + 20_000)
     split = Split(*(part[part < len(kept)] for part in (capture.split.train, capture.split.test)))
     return replace(capture, frames=replace(frames, exposure=late), split=split)

@@ -6,12 +6,12 @@ import torch
 
 from sharpfield.core.camera import Camera
 from sharpfield.preparation.poses.find_checks import advice, relief
-from sharpfield.preparation.poses.mapping import Map
+from sharpfield.preparation.poses.mapping import SfmMap
 
 FOCAL_PX, VIEWS, POINTS = 180.0, 9, 240
 
 
-def mapped(relief_of_depth: float, *, sideways: float = 0.25, few: int = 0) -> Map:
+def mapped(relief_of_depth: float, *, sideways: float = 0.25, few: int = 0) -> SfmMap:
     """What a camera sees that passes a leaning wall five away, drawn in noise of half a px.
 
     Args:
@@ -29,7 +29,7 @@ def mapped(relief_of_depth: float, *, sideways: float = 0.25, few: int = 0) -> M
     sharing = np.ones((VIEWS, POINTS), bool)
     # A map is made of what was seen, so noise bends it: half a px, averaged over nine images.
     points += 0.5 / 3 * 5 / FOCAL_PX * draw.standard_normal((POINTS, 3)) * [1, 1, 4]
-    return Map(
+    return SfmMap(
         registered=np.ones(VIEWS, bool),
         poses=poses,
         camera=camera,
@@ -85,7 +85,7 @@ def test_the_world_it_is_in_does_not_matter() -> None:
     ].numpy()
     turn *= np.sign(np.linalg.det(turn))
     poses = np.concatenate([turn @ made.poses[:, :, :3], 7 * (turn @ made.poses[:, :, 3:]) + 2], -1)
-    moved = Map(
+    moved = SfmMap(
         made.registered, poses, made.camera, 7 * made.points @ turn.T + 2, made.point_error_px,
         made.observations, made.error_px,
     )  # fmt: skip
@@ -97,7 +97,7 @@ def test_the_world_it_is_in_does_not_matter() -> None:
 def test_images_that_share_too_little_say_nothing() -> None:
     made = mapped(0.0)
     alone = made.observations[made.observations[:, 0] == made.observations[:, 1] % VIEWS]
-    lonely = Map(
+    lonely = SfmMap(
         made.registered, made.poses, made.camera, made.points, made.point_error_px, alone,
         made.error_px,
     )  # fmt: skip

@@ -33,7 +33,7 @@ from sharpfield.core.tone import Tone, luma, tone_of
 from sharpfield.events.double_integral import FLOOR
 from sharpfield.events.index import EventIndex, first_since
 from sharpfield.events.site_colour import site_channels
-from sharpfield.preparation.thresholds import BRIGHT, DARK, linear_light, neighbours
+from sharpfield.preparation.thresholds import BRIGHT, DARK, consecutive_pairs, linear_light
 
 MAX_WEIGHT = 4.0
 """Most thresholds that an event right after a refractory time counts for."""
@@ -82,7 +82,7 @@ def find_exposure_pairs(capture: Capture, *, most: int) -> list[ExposurePair]:
         CaptureError: There are no events, or not two frames of one camera.
     """
     frames, events = capture.needed_frames, capture.needed_events
-    pairs = neighbours(capture, np.arange(len(frames)))  # [m, 2]
+    pairs = consecutive_pairs(capture, np.arange(len(frames)))  # [m, 2]
     if not len(pairs) or not len(events):
         raise CaptureError(
             "comparing frames with events needs two frames of one camera, and events",

@@ -25,7 +25,7 @@ UNKNOWN, DEAD, HOT = (205, 205, 205), (0, 0, 0), (245, 170, 30)
 def write_calibration(capture: Capture, found: ThresholdCalibration, out: Path) -> dict[str, Any]:
     """Write `calibration.json`, `pixels.npz` and `pixels.png` to a folder; returns the numbers."""
     out.mkdir(parents=True, exist_ok=True)
-    about = summary(capture, found)
+    about = calibration_summary(capture, found)
     write_json(out / NUMBERS, about)
     with replacing(out / PIXELS) as temporary:
         write_arrays(
@@ -41,7 +41,7 @@ def write_calibration(capture: Capture, found: ThresholdCalibration, out: Path) 
     return about
 
 
-def summary(capture: Capture, found: ThresholdCalibration) -> dict[str, Any]:
+def calibration_summary(capture: Capture, found: ThresholdCalibration) -> dict[str, Any]:
     """Plain values for JSON. Thresholds are natural log; `sigma` is one standard deviation."""
     known = known_thresholds(capture)
     return {
@@ -69,7 +69,7 @@ def summary(capture: Capture, found: ThresholdCalibration) -> dict[str, Any]:
     }
 
 
-def as_text(about: dict[str, Any]) -> str:
+def calibration_text(about: dict[str, Any]) -> str:
     """The summary in lines for a terminal."""
     lines = []
     for sign, name in (("negative", "darker"), ("positive", "brighter")):

@@ -19,7 +19,7 @@ from sharpfield.preparation.calibrate.exposure_pairs import (
     change_by_events,
     find_exposure_pairs,
 )
-from sharpfield.preparation.doctor.findings import Checkup, Curve
+from sharpfield.preparation.doctor.findings import Checkup, MeasuredCurve
 from sharpfield.report.colormaps import colour_signs
 
 PAIRS = 5
@@ -154,7 +154,7 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
     )
     order = np.argsort(np.concatenate([shifts, fine]))
     checkup.curves.append(
-        Curve(
+        MeasuredCurve(
             "Correlation of events with frames, for other times of the frames",
             "shift of the frames, ms",
             np.concatenate([shifts, fine])[order] / 1000,

@@ -28,7 +28,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Curve:
+class MeasuredCurve:
     """A measured value over a parameter."""
 
     title: str
@@ -45,7 +45,7 @@ class Checkup:
     findings: list[Finding] = field(default_factory=list[Finding])
     images: dict[str, UInt8[np.ndarray, "h w 3"]] = field(default_factory=dict)
     """Images by caption."""
-    curves: list[Curve] = field(default_factory=list[Curve])
+    curves: list[MeasuredCurve] = field(default_factory=list[MeasuredCurve])
 
     def add(
         self, severity: Severity, check: str, what: str, *, got: str = "", do: str = ""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sharpfield.core.capture import Capture
-from sharpfield.preparation.doctor.findings import Checkup, Curve
+from sharpfield.preparation.doctor.findings import Checkup, MeasuredCurve
 from sharpfield.report.capture import capture_section
 from sharpfield.report.page import CaptionedImage, ImageEncoding, write_page
 
@@ -58,7 +58,7 @@ def verdict(checkup: Checkup) -> str:
     return summary + (f", {warnings} warning{'s' * (warnings > 1)}" if warnings else "")
 
 
-def _plot(curve: Curve) -> dict[str, Any]:
+def _plot(curve: MeasuredCurve) -> dict[str, Any]:
     """A line plot with its extremes labelled, as coordinates in the SVG."""
     left, right = float(curve.x.min()), float(curve.x.max())
     low, high = float(curve.y.min()), float(curve.y.max())

@@ -16,7 +16,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.geometry.two_views import PairMatches, find_features, match_pairs, sampson_px
-from sharpfield.preparation.doctor.findings import Checkup, Curve
+from sharpfield.preparation.doctor.findings import Checkup, MeasuredCurve
 from sharpfield.preparation.poses.images import SfmImages, sfm_images
 
 MOST_IMAGES = 8
@@ -63,7 +63,7 @@ def check_images(capture: Capture, checkup: Checkup) -> None:
     best = int(errors.argmin())
     focal = capture.camera.fx_px
     checkup.curves.append(
-        Curve(
+        MeasuredCurve(
             "Epipolar distance of matches, px, for other focal lengths",
             "focal length, px",
             FACTORS * focal,
@@ -117,7 +117,7 @@ def check_motion(capture: Capture, checkup: Checkup) -> None:
         return
     now, best = found[len(shifts_us) // 2], int(found.argmax())
     checkup.curves.append(
-        Curve(
+        MeasuredCurve(
             "Correlation of the event rate with the image motion of the poses",
             "shift of the poses, ms",
             -shifts_us / 1000.0,
@@ -160,7 +160,7 @@ def check_blur(capture: Capture, checkup: Checkup) -> None:
         do="shorten the exposure" if much else "",
     )
     checkup.curves.append(
-        Curve("Blur of each frame, px", "frame", blurred.astype(np.float64), length)
+        MeasuredCurve("Blur of each frame, px", "frame", blurred.astype(np.float64), length)
     )
 
 

@@ -22,7 +22,7 @@ from sharpfield.preparation.poses.images import sfm_images
 from sharpfield.preparation.poses.path import (
     FramesOnPath,
     capture_on_path,
-    frames_of,
+    frames_on_tracks,
     path_through,
 )
 from sharpfield.preparation.poses.world import KnownPoses
@@ -140,7 +140,7 @@ def _timed(
     kept = np.flatnonzero(inside)
     track_of = np.zeros(int(frames.track.max()) + 1, np.int64)
     return FramesOnPath(
-        frames_of(frames, kept, np.zeros(len(kept), np.int64)), laid_path, kept, track_of
+        frames_on_tracks(frames, kept, np.zeros(len(kept), np.int64)), laid_path, kept, track_of
     )
 
 

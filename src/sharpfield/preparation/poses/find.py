@@ -23,8 +23,8 @@ from sharpfield.preparation.poses.mapping import (
     MIN_INLIERS,
     Intrinsics,
     LensTask,
-    Map,
     MatchCounts,
+    SfmMap,
     map_images,
 )
 from sharpfield.preparation.poses.path import FramesOnPath, capture_on_path, path_through
@@ -74,7 +74,7 @@ class PosesFound:
     capture: Capture
     images: SfmImages
     """The images the poses were found from."""
-    map: Map
+    map: SfmMap
     """In the world of the capture."""
     counts: MatchCounts
     failures: tuple[Failure, ...]
@@ -138,14 +138,14 @@ def _default_intrinsics(capture: Capture) -> Intrinsics:
     return "find" if capture.known.intrinsics == "unknown" else "given"
 
 
-def _transformed(found: Map, change: Similarity) -> Map:
+def _transformed(found: SfmMap, change: Similarity) -> SfmMap:
     poses = found.poses.copy()
     poses[found.registered] = change.poses(found.poses[found.registered])
     return replace(found, poses=poses, points=change.points(found.points))
 
 
 def _with_poses(
-    capture: Capture, images: SfmImages, found: Map, intrinsics: Intrinsics
+    capture: Capture, images: SfmImages, found: SfmMap, intrinsics: Intrinsics
 ) -> tuple[Capture, FramesOnPath]:
     there = found.registered
     laid = path_through(
@@ -192,7 +192,7 @@ def _why(image: int, images: SfmImages, counts: MatchCounts) -> tuple[str, str]:
 
 
 def _failed(
-    capture: Capture, images: SfmImages, found: Map | None, counts: MatchCounts
+    capture: Capture, images: SfmImages, found: SfmMap | None, counts: MatchCounts
 ) -> CaptureError:
     """The error when no images, or too few, could be registered."""
     count = 0 if found is None else int(found.registered.sum())

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from sharpfield.core.seed import evenly_spread
-from sharpfield.preparation.poses.mapping import Intrinsics, Map
+from sharpfield.preparation.poses.mapping import Intrinsics, SfmMap
 
 PAIRS = 12
 FAR = 0.75
@@ -47,7 +47,7 @@ class Relief:
         return self.off_plane < LEAST_OFF
 
 
-def relief(found: Map) -> Relief | None:
+def relief(found: SfmMap) -> Relief | None:
     """Depth variation of a map; None if too few points are shared to measure it."""
     pairs = _pairs_far_apart(found)
     if not pairs:
@@ -76,7 +76,7 @@ def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | No
     )
 
 
-def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
+def _pairs_far_apart(found: SfmMap) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
     """Pairs of distant images that share points, and the indices of these points."""
     view, point = found.observations.T
     good = found.track_length[point] >= VIEWS
@@ -95,7 +95,7 @@ def _pairs_far_apart(found: Map) -> list[tuple[int, int, Int64[np.ndarray, "m"]]
 
 
 def _off_plane(
-    found: Map, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
+    found: SfmMap, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
 ) -> float:
     """Share of points whose positions in two images the best homography does not relate."""
     first, second = (_ideal_px(found, i, rows) for i in (one, two))
@@ -104,14 +104,14 @@ def _off_plane(
     return 1.0 if explained is None else 1 - float(explained.mean())
 
 
-def _ideal_px(found: Map, view: int, rows: Int64[np.ndarray, "m"]) -> Float64[np.ndarray, "m 2"]:
+def _ideal_px(found: SfmMap, view: int, rows: Int64[np.ndarray, "m"]) -> Float64[np.ndarray, "m 2"]:
     """Projections of points by a pinhole camera without distortion."""
     pose = found.poses[view]
     local = (found.points[rows] - pose[:, 3]) @ pose[:, :3]
     return found.camera.fx_px * local[:, :2] / local[:, 2:]
 
 
-def _thickness(found: Map) -> float:
+def _thickness(found: SfmMap) -> float:
     """Median distance from the plane fitted to the closest half of the points, over their depth."""
     good = found.points[found.track_length >= VIEWS]
     kept = np.ones(len(good), bool)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64, UInt8
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import OptionError
 from sharpfield.metrics.image import gradient_energy
-from sharpfield.preparation.deblurring import deblur
+from sharpfield.preparation.deblurring import deblur_frames
 from sharpfield.preparation.options import DeblurOptions, ImageSource
 from sharpfield.preparation.thresholds import FoundThresholds
 from sharpfield.report.colormaps import stored_as_bytes
@@ -93,7 +93,7 @@ def sharpness(images: UInt8[np.ndarray, "n h w c"]) -> Float[np.ndarray, "n"]:
 
 def _deblurred(capture: Capture, instants: int) -> SfmImages:
     every = Split(np.arange(len(capture.needed_frames)), np.zeros(0, np.int64))
-    made = deblur(replace(capture, split=every), DeblurOptions(instants=instants))
+    made = deblur_frames(replace(capture, split=every), DeblurOptions(instants=instants))
     return SfmImages(
         "edi",
         stored_as_bytes(made.images.reshape(-1, *made.images.shape[2:])),

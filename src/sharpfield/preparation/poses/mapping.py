@@ -92,7 +92,7 @@ class MatchCounts:
 
 
 @dataclass(frozen=True)
-class Map:
+class SfmMap:
     """Poses and points of structure from motion, in a world of arbitrary scale."""
 
     registered: Bool[np.ndarray, "n"]
@@ -114,7 +114,7 @@ class Map:
 
 def map_images(
     images: UInt8[np.ndarray, "n h w c"], task: LensTask, *, seed: int = 0
-) -> tuple[Map | None, MatchCounts]:
+) -> tuple[SfmMap | None, MatchCounts]:
     """Find the poses of images of one camera.
 
     Args:
@@ -135,7 +135,7 @@ def map_images(
             "too few images to find poses from",
             got=f"{len(images)}, at least {MIN_IMAGES} are needed",
         )
-    best: tuple[Map | None, MatchCounts] | None = None
+    best: tuple[SfmMap | None, MatchCounts] | None = None
     with tempfile.TemporaryDirectory(prefix="sharpfield-poses-") as folder, _quiet(colmap):
         names = [f"{i:06d}.png" for i in range(len(images))]
         (Path(folder) / "images").mkdir()
@@ -152,7 +152,7 @@ def map_images(
     return best
 
 
-def _count(made: Map | None) -> int:
+def _count(made: SfmMap | None) -> int:
     return 0 if made is None else int(made.registered.sum())
 
 
@@ -176,7 +176,7 @@ class _Work:
     task: LensTask
     seed: int
 
-    def run(self, effort: Effort, folder: Path) -> tuple[Map | None, MatchCounts]:
+    def run(self, effort: Effort, folder: Path) -> tuple[SfmMap | None, MatchCounts]:
         folder.mkdir()
         self.colmap.set_random_seed(self.seed)
         database = folder / "database.db"
@@ -237,7 +237,7 @@ class _Work:
                 pairs_seen, planar_count = pairs_seen + 1, planar_count + (view.config in planar)
         return MatchCounts(features, matches, partners, planar_count / max(pairs_seen, 1))
 
-    def _map(self, database: Path, folder: Path, effort: Effort) -> Map | None:
+    def _map(self, database: Path, folder: Path, effort: Effort) -> SfmMap | None:
         options = self.colmap.IncrementalPipelineOptions()
         options.multiple_models, options.min_model_size = False, MIN_IMAGES
         options.extract_colors, options.random_seed = False, self.seed
@@ -274,7 +274,7 @@ def _parameters(task: LensTask) -> tuple[str, list[float]]:
     raise CaptureError("COLMAP has no camera model for the lens", got=camera.lens)
 
 
-def _as_map(made: Any, count: int, task: LensTask) -> Map:
+def _as_map(made: Any, count: int, task: LensTask) -> SfmMap:
     """The arrays of a reconstruction of COLMAP."""
     registered, error = np.zeros(count, bool), np.full(count, np.nan)
     poses, observations = np.zeros((count, 3, 4)), []
@@ -301,7 +301,7 @@ def _as_map(made: Any, count: int, task: LensTask) -> Map:
         camera = camera_of(
             held.model.name, held.width, held.height, tuple(held.params), where="the camera found"
         )
-    return Map(
+    return SfmMap(
         registered=registered,
         poses=poses,
         camera=camera,

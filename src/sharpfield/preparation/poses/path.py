@@ -107,7 +107,9 @@ def path_through(
     path = Still(still) if not moving else Tracks(moving, still)
     if len(moving) == 1 and not standing:
         path = moving[0]
-    return FramesOnPath(frames_of(frames, kept, track_of[frames.track[kept]]), path, kept, track_of)
+    return FramesOnPath(
+        frames_on_tracks(frames, kept, track_of[frames.track[kept]]), path, kept, track_of
+    )
 
 
 def capture_on_path(
@@ -174,7 +176,7 @@ def _beyond(
     return torch.cat([rotation, position], -1).numpy()
 
 
-def frames_of(
+def frames_on_tracks(
     frames: Frames, chosen: Int64[np.ndarray, "m"], track: Int64[np.ndarray, "m"]
 ) -> Frames:
     """Some of the frames, on new tracks; without depth, whose units are those of another world."""

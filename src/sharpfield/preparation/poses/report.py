@@ -18,7 +18,7 @@ from sharpfield.report.page import CaptionedImage, ComparedView, ImageEncoding, 
 from sharpfield.report.tables import TextTable
 
 
-def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
+def poses_summary(original: Capture, found: PosesFound) -> dict[str, Any]:
     """Plain values for JSON.
 
     Lengths are in units of the new world. Errors are reprojection errors in px.
@@ -65,7 +65,7 @@ def summary(original: Capture, found: PosesFound) -> dict[str, Any]:
     }
 
 
-def as_text(about: dict[str, Any]) -> str:
+def poses_text(about: dict[str, Any]) -> str:
     """The summary as text for the terminal; each failed image with its reason and what to do."""
     frames, points, camera = about["frames"], about["points"], about["camera"]
     lines = [

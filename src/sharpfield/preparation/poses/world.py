@@ -14,7 +14,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.space import Similarity, average_pose
 from sharpfield.metrics.pose import PoseError, absolute_error, align, relative_error
-from sharpfield.preparation.poses.mapping import Map
+from sharpfield.preparation.poses.mapping import SfmMap
 
 MEDIAN_DEPTH = 1.0
 
@@ -37,7 +37,7 @@ class KnownPoses:
     """World-from-camera; NaN where unknown."""
 
 
-def centred_world(found: Map) -> Similarity:
+def centred_world(found: SfmMap) -> Similarity:
     """Average camera at the origin, median depth of the points 1."""
     centre = average_pose(found.poses[found.registered])
     scale = MEDIAN_DEPTH / float(np.median(depths(found)))
@@ -45,7 +45,7 @@ def centred_world(found: Map) -> Similarity:
     return Similarity(scale, rotation, -scale * rotation @ centre[:, 3])
 
 
-def measured_world(found: Map, capture: Capture, frame: Int64[np.ndarray, "n"]) -> Similarity:
+def measured_world(found: SfmMap, capture: Capture, frame: Int64[np.ndarray, "n"]) -> Similarity:
     """The same, scaled to the units of the measured depth.
 
     Raises:
@@ -68,7 +68,7 @@ def measured_world(found: Map, capture: Capture, frame: Int64[np.ndarray, "n"]) 
     return Similarity(base.scale * factor, base.rotation, base.translation * factor)
 
 
-def known_world(found: Map, known: KnownPoses) -> tuple[Similarity, PoseErrors]:
+def known_world(found: SfmMap, known: KnownPoses) -> tuple[Similarity, PoseErrors]:
     """The similarity to the world of known poses, and the remaining differences.
 
     Returns:
@@ -90,7 +90,7 @@ def known_world(found: Map, known: KnownPoses) -> tuple[Similarity, PoseErrors]:
     return similarity, PoseErrors(absolute_error(estimate, truth), relative_error(estimate, truth))
 
 
-def depths(found: Map) -> Float64[np.ndarray, "o"]:
+def depths(found: SfmMap) -> Float64[np.ndarray, "o"]:
     """Depth of each observation along the optical axis."""
     view, point = found.observations.T
     toward = found.points[point] - found.poses[view, :, 3]
