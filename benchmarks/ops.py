@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sharpfield.ops import compositing, grid, hash_grid, total_variation
+from sharpfield.ops import compositing, grid, hash_grid
 from sharpfield.ops._dispatch import Op, using
 
 RAYS, SAMPLES = 1152, 128
@@ -76,7 +76,7 @@ WORKLOADS: dict[str, tuple[Op[..., Any], Callable[[], tuple[Any, ...]]]] = {
     "mixture, coarse": (grid.plane_line_mixture, lambda: mixture(COARSE)),
     "mixture, fine": (grid.plane_line_mixture, lambda: mixture(FINE)),
     "total variation, fine": (
-        total_variation.total_variation,
+        grid.total_variation,
         lambda: (normal(FINE[1], FINE[0], CHANNELS[0]),),
     ),
     "hash grid": (hash_grid.hash_features, hashed),
