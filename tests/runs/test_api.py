@@ -147,6 +147,7 @@ def test_options_are_changed_by_name(capture: sf.Capture, tmp_path: Path) -> Non
         (lambda run: sf.open_run(run.folder.parent), "this is not a run"),
         (lambda run: sf.train("ev-splatt", run.capture, out="x"), "unknown recipe"),
         (lambda run: sf.train("ev-splat", run.capture, out=run.folder), "already holds a run"),
+        (lambda run: resumed(run, run.capture.without(events=True)), "with another capture"),
         (lambda run: sf.simulate("gardn"), "(?s)unknown scene.*garden"),
         (lambda run: sf.simulate(size=(5, 5)), "not the size of a sensor"),
         (lambda run: sf.write(run.capture, "x", "colmapp"), "unknown layout to write"),
@@ -157,6 +158,10 @@ def test_options_are_changed_by_name(capture: sf.Capture, tmp_path: Path) -> Non
 def test_what_is_wrong_is_said(run: sf.Run, wrong, said: str) -> None:
     with pytest.raises(sf.SharpfieldError, match=said):
         wrong(run)
+
+
+def resumed(run: sf.Run, capture: sf.Capture) -> sf.Run:
+    return sf.train("ev-splat", capture, out=run.folder, device="cpu", steps=10, resume=True)
 
 
 def changed(run: sf.Run, options: dict) -> sf.Run:

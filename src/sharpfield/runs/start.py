@@ -7,6 +7,7 @@ from rich.console import Console
 
 from sharpfield.captures.native.layout import read, write
 from sharpfield.core.capture import Capture
+from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
 from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
@@ -36,15 +37,23 @@ def train_run(
         console: Where progress is shown.
 
     Raises:
-        RunError: The folder holds another run, or a loss is not finite.
+        RunError: The folder holds another run, or one on another capture; or a loss is not finite.
     """
     if not options.resume:
         require_unused(folder)
         write_run_config(folder, config)
     if config.capture == OWN_CAPTURE:
-        if not options.resume or not (folder / OWN_CAPTURE).exists():
-            write(capture, folder / OWN_CAPTURE)
-        capture = read(folder / OWN_CAPTURE)  # what will be read when it is opened again
+        given, own = capture, folder / OWN_CAPTURE
+        if not options.resume or not own.exists():
+            write(given, own)
+        capture = read(own)  # what will be read when the run is opened again
+        if repr(capture) != repr(given):  # counts, sizes and spans of frames and events
+            raise RunError(
+                "the run was started with another capture",
+                where=own,
+                got=repr(given),
+                do="resume with the same capture, or train into another folder",
+            )
     part = block_of(capture, config.block)
     chosen = used(part, config.use)
     built: list[Any] = []
