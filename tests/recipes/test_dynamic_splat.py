@@ -221,6 +221,19 @@ def test_thresholds_gains_and_offsets_can_be_learned():
 
 
 @pytest.mark.parametrize("frames", [True, False])
+def test_events_at_rectified_positions_are_learned_from(frames: bool):
+    capture = tiny_moving().without(frames=not frames)
+    events = capture.needed_events
+    x, y = (np.clip(column + np.float32(0.25), 0, 15) for column in (events.x, events.y))
+    rectified = replace(events, x=x.astype(np.float32), y=y.astype(np.float32))
+    model = small().build(replace(capture, events=rectified), 0)
+    assert model.sampler.cameras[0].index is None
+    terms = model.losses(model.draw(STEPS - 1), STEPS - 1)
+    terms["events"].backward()
+    assert model.scene.moving.means.grad.any() and torch.isfinite(terms["events"])
+
+
+@pytest.mark.parametrize("frames", [True, False])
 def test_events_behind_a_colour_filter_are_learned_from(frames: bool):
     capture = tiny_moving().without(frames=not frames)
     coloured = replace(capture, events=replace(capture.needed_events, bayer="RGGB"))
