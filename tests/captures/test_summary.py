@@ -7,7 +7,7 @@ import pytest
 
 from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.native.layout import write
-from sharpfield.captures.summary import capture_summary, summary
+from sharpfield.captures.summary import capture_summary, path_summary
 from sharpfield.captures.writers import llff_events as write_llff_events
 from sharpfield.core.capture import Known
 from sharpfield.core.errors import CaptureError
@@ -26,7 +26,7 @@ def write_flat(path, events, factor=1):
 
 def test_a_capture(panning, tmp_path):
     write(panning, tmp_path / "panning")
-    about = summary(tmp_path / "panning")
+    about = path_summary(tmp_path / "panning")
     assert about["kind"] == "capture" and about["name"] == panning.name
     events, frames = about["events"], about["frames"]
     assert events["count"] == 5_000
@@ -55,7 +55,7 @@ def test_the_path_is_as_long_as_it_is(panning):
 def test_everything_is_plain_json(panning, tmp_path):
     noted = replace(panning, notes={"threshold_on": 0.2, "map": np.zeros((10, 12))})
     write(noted, tmp_path / "panning")
-    about = summary(tmp_path / "panning")
+    about = path_summary(tmp_path / "panning")
     assert json.loads(json.dumps(about, allow_nan=False)) == about
     assert about["notes"] == {"threshold_on": 0.2, "map": "array (10, 12)"}
 
@@ -68,7 +68,7 @@ def test_photos_of_unknown_motion_are_neither_blurry_nor_sharp(panning):
 def test_a_file_of_events(tmp_path, some_events):
     events = some_events(2_000)
     write_events(tmp_path / "events.h5", events)
-    about = summary(tmp_path / "events.h5")
+    about = path_summary(tmp_path / "events.h5")
     assert about["kind"] == "events"
     assert about["events"]["count"] == 2_000
     assert about["events"]["on"] == (events.p > 0).sum()
@@ -81,25 +81,25 @@ def test_a_file_of_events(tmp_path, some_events):
 def test_a_file_that_does_not_state_its_unit(tmp_path, some_events, name):
     events = some_events(2_000)
     write_flat(tmp_path / name, events, factor=1_000)
-    about = summary(tmp_path / name)["events"]
+    about = path_summary(tmp_path / name)["events"]
     assert about["unit"] is None and about["t_first_us"] is None and about["rate_per_s"] is None
     assert (about["t_first"], about["t_last"]) == tuple(events.t_us[[0, -1]] * 1_000)
     assert (about["width"], about["height"]) == (12, 10)
     assert about["size_from"] == "largest coordinates"
-    told = summary(tmp_path / name, ReadOptions(event_unit="ns"))["events"]
+    told = path_summary(tmp_path / name, ReadOptions(event_unit="ns"))["events"]
     assert told["t_last_us"] == events.t_us[-1]
 
 
 def test_the_events_of_a_capture_have_the_unit_of_its_layout(panning, tmp_path):
     write_llff_events.write(panning, tmp_path / "scene")
     write_flat(tmp_path / "scene" / "events.h5", panning.events, factor=1_000)
-    about = summary(tmp_path / "scene" / "events.h5")["events"]
+    about = path_summary(tmp_path / "scene" / "events.h5")["events"]
     assert about["unit"] == "ns" and about["t_last_us"] == panning.events.t_us[-1]
 
 
 def test_no_events(tmp_path, some_events):
     write_flat(tmp_path / "events.h5", some_events(3)[:0])
-    about = summary(tmp_path / "events.h5")["events"]
+    about = path_summary(tmp_path / "events.h5")["events"]
     assert about["count"] == 0 and about["t_first_us"] is None
 
 
@@ -108,9 +108,9 @@ def test_unsound_events_are_reported(tmp_path, some_events):
     turned = replace(events, t_us=events.t_us[::-1])
     write_flat(tmp_path / "events.h5", turned)
     with pytest.raises(CaptureError, match="not ascending"):
-        summary(tmp_path / "events.h5")
+        path_summary(tmp_path / "events.h5")
 
 
 def test_a_missing_capture(tmp_path):
     with pytest.raises(CaptureError, match="capture not found"):
-        summary(tmp_path / "garden")
+        path_summary(tmp_path / "garden")

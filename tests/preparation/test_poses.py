@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.paths.pose_layouts import ExternalPath
 from sharpfield.captures.read import read_capture
+from sharpfield.captures.trajectory_files import ExternalPath
 from sharpfield.cli.poses import Elsewhere, poses_command
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, MissingExtra, OptionError

@@ -32,7 +32,7 @@ PATH_SAMPLES = 1000
 EVENT_SUFFIXES = (".h5", ".hdf5", ".npz")
 
 
-def summary(path: Path | str, options: ReadOptions = NO_OPTIONS) -> dict[str, Any]:
+def path_summary(path: Path | str, options: ReadOptions = NO_OPTIONS) -> dict[str, Any]:
     """Summary of a capture's folder, or of a single file of events.
 
     Args:

@@ -26,10 +26,10 @@ def inspect_command(
         trust_pickle: Open pickled files, which may name programs to run; only arrays of numbers
             are built from them, and anything else is refused.
     """
-    from sharpfield.captures.summary import summary
+    from sharpfield.captures.summary import path_summary
 
     options = ReadOptions(layout=layout, event_unit=event_unit, trust_pickle=trust_pickle)
-    found = summary(path, options)
+    found = path_summary(path, options)
     print(json_format.dumps(found, indent=2) if json else as_text(found))
 
 

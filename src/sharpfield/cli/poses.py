@@ -14,7 +14,7 @@ from sharpfield.core.files import write_json
 from sharpfield.preparation.options import PoseOptions
 
 if TYPE_CHECKING:
-    from sharpfield.captures.paths.pose_layouts import ExternalPath
+    from sharpfield.captures.trajectory_files import ExternalPath
     from sharpfield.core.capture import Capture
     from sharpfield.preparation.poses.external import Mount
 
@@ -46,7 +46,7 @@ class Elsewhere:
 
     def mount(self) -> "Mount":
         """How the body and the clock of the file relate to the camera's."""
-        from sharpfield.captures.paths.pose_layouts import read_hand_eye
+        from sharpfield.captures.trajectory_files import read_hand_eye
         from sharpfield.preparation.poses.external import Mount
 
         hand = None if self.hand_eye is None else read_hand_eye(self.hand_eye)
@@ -71,8 +71,8 @@ def poses_command(
         elsewhere: Poses from a file.
     """
     from sharpfield.captures.native import layout as native
-    from sharpfield.captures.paths.pose_layouts import read_path
     from sharpfield.captures.read import read_capture
+    from sharpfield.captures.trajectory_files import read_path
     from sharpfield.preparation.poses.external import known_at
     from sharpfield.preparation.poses.find import find_poses
     from sharpfield.preparation.poses.report import poses_summary, poses_text, write_poses_page

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from sharpfield.captures.paths.pose_file import read_poses
+from sharpfield.captures.trajectory_files import read_poses
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream

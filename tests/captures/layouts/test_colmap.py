@@ -7,7 +7,7 @@ import torch
 
 from sharpfield.captures.layout import ReadOptions
 from sharpfield.captures.layouts import colmap, deblur_nerf
-from sharpfield.captures.layouts.colmap_model import camera_of, find_model, read_model
+from sharpfield.captures.layouts.colmap import camera_of, find_model, read_model
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 

@@ -2,7 +2,7 @@
 
     images_1/NN.png             8-bit RGB, sorted by name
     images_1/timestamps.npz     timestamps_start, timestamps_end: us, one per image; equal if sharp
-    poses_bounds.npy            one row per image, see `layouts._poses_bounds`
+    poses_bounds.npy            one row per image, see `layouts.deblur_nerf`
     all_poses_bounds.npy        the trajectory, one row per stamp
     all_timestamps.npy          its stamps, us
     events.h5                   x, y, t, p
@@ -29,7 +29,7 @@ from jaxtyping import Bool, Int64, Shaped
 from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import choose_images
-from sharpfield.captures.layouts._poses_bounds import PosesBounds, read_poses_bounds
+from sharpfield.captures.layouts.deblur_nerf import PosesBounds, read_poses_bounds
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import POSE_TOLERANCE_US, Capture, Clock, Known, Note, Thresholds
 from sharpfield.core.errors import CaptureError

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sharpfield.captures.native import layout as native
-from sharpfield.captures.paths.pose_file import read_poses
+from sharpfield.captures.trajectory_files import read_poses
 from sharpfield.core.capture import (
     POSE_TOLERANCE_US,
     Capture,

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64, Int64
 
 from sharpfield.captures.layouts._photos import depth_bounds, same_camera, scaled_camera
-from sharpfield.captures.paths.pose_layouts import ExternalPath
+from sharpfield.captures.trajectory_files import ExternalPath
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry import se3

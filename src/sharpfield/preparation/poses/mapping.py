@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from sharpfield.captures.layouts.colmap_model import camera_of
+from sharpfield.captures.layouts.colmap import camera_of
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import CaptureError, need
 from sharpfield.core.lenses import LENSES

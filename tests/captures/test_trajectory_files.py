@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sharpfield.captures.paths.pose_layouts import path_layout, read_hand_eye, read_path
+from sharpfield.captures.trajectory_files import path_layout, read_hand_eye, read_path
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.geometry import se3
 

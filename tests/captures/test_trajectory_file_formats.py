@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sharpfield.captures.native.trajectory import write_trajectory
-from sharpfield.captures.paths.pose_file import read_poses
+from sharpfield.captures.trajectory_files import read_poses
 from sharpfield.core.capture import Clock
 from sharpfield.core.errors import CaptureError
 from sharpfield.geometry.trajectory import Stamped, Tracks
