@@ -5,9 +5,10 @@
     hold=K                  optional marker: every K-th photo is held out (sharp in Deblur-NeRF)
     sparse/0/               optional COLMAP model from which the poses came
 
-The pose table is that of LLFF, also used by Ev-DeblurNeRF. Each row has 17 numbers: a 3x5 matrix in row-major order, `[R | t | (height, width, focal)]`, then
-the nearest and farthest depth seen by that camera. The columns of R are the camera's down, right
-and backward axes in the world; here they become OpenCV's right, down, forward.
+The pose table is that of LLFF, also used by Ev-DeblurNeRF. Each row has 17 numbers: a 3x5 matrix in
+row-major order, `[R | t | (height, width, focal)]`, then the nearest and farthest depth seen by
+that camera. The columns of R are the camera's down, right and backward axes in the world; here they
+become OpenCV's right, down, forward.
 
 Source: Ma et al., *Deblur-NeRF* (CVPR 2022) and its released scenes; Mildenhall et al., *Local
 Light Field Fusion* (SIGGRAPH 2019), and its data loader.
