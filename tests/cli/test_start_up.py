@@ -52,6 +52,7 @@ def answered(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str]]:
         (("train", "ev-splat", "x", "--out", "y", "--steps", "many"), 2, "steps"),
         (("train", "ev-splat", "x", "--out", "y", "--sampling.view", "3"), 2, "--sampling.views"),
         (("train", "nerf", "x", "--out", "y", "--lrr", "3"), 2, "did you mean --lr?"),
+        (("train", "nerf", "x", "--out", "y", "--preset", "draught"), 2, "did you mean draft?"),
         (("train", "x", "--out", "y", "--minutes", "3"), 2, "unknown recipe"),
         (("blocks", "--out", "x"), 2, "PATH"),
         (("evaluate", "x", "--train-views", "all"), 2, "train-views"),

@@ -21,6 +21,7 @@ import pytest
 import sharpfield
 from sharpfield.captures.read import LAYOUTS
 from sharpfield.cli import commands as command_line
+from sharpfield.cli.recipe_options import flag_of
 from sharpfield.core.lenses import LENSES
 from sharpfield.metrics.registry import METRICS
 from sharpfield.recipes import RECIPES, recipe_named
@@ -154,7 +155,7 @@ def recipe_options() -> frozenset[str]:
 @functools.cache
 def flags() -> frozenset[str]:
     """Flags of all commands and recipes, with `_` for `-`."""
-    found = set(recipe_options())
+    found = {flag_of(option).replace("-", "_") for option in recipe_options()}
     for command in command_line.COMMANDS:
         said = io.StringIO()
         with contextlib.redirect_stdout(said), pytest.raises(SystemExit):

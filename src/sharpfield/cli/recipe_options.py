@@ -18,9 +18,6 @@ from sharpfield.recipes import RECIPES, names_in_source, recipe_named
 from sharpfield.recipes.settings.options import changed, field_texts, new_name, options_of
 from sharpfield.recipes.settings.presets import presets_of
 
-NOT_FLAGS = ("steps",)
-"""Fields of recipes that have a flag of the command: `--steps` also stretches the schedule."""
-
 Numbers = dict[str, Any]
 """Options that were given, by name."""
 
@@ -36,7 +33,7 @@ def expect_recipe(words: Sequence[str]) -> None:
 
 
 def expect_known(command: Callable[..., None], words: Sequence[str]) -> None:
-    """Refuse options that the named recipe cannot have, before it is imported.
+    """Refuse options and presets that the named recipe cannot have, before it is imported.
 
     Raises:
         OptionError: There is one.
@@ -45,16 +42,19 @@ def expect_known(command: Callable[..., None], words: Sequence[str]) -> None:
     known = None if name is None else names_in_source(name)
     if known is None:
         return
-    options, mentioned = known
     flags = [word.partition("=")[0] for word in words if word.startswith("--") and word != "--"]
     taken = _flags_of(_own_parameters(command)) | {"help"}
     for flag in flags:
         asked = flag[2:].replace("-", "_").removeprefix("recipe.").removeprefix("no_")
         parts = asked.split(".")
         groups = {".".join(parts[: i + 1]) for i in range(len(parts))}
-        if asked not in options | taken and not groups & mentioned:
-            similar = {f"--{one.replace('_', '-')}" for one in options | taken}
+        if asked not in known.options | taken and not groups & known.old:
+            similar = {f"--{one.replace('_', '-')}" for one in known.options | taken}
             raise OptionError("unknown option", got=flag, do=did_you_mean(flag, sorted(similar)))
+    for preset in _value_of("--preset", words).replace("+", ",").split(","):
+        if preset and preset not in known.presets:
+            do = did_you_mean(preset, sorted(known.presets))
+            raise OptionError(f"the recipe {name} has no preset {preset!r}", do=do)
 
 
 def recipe_in(words: Sequence[str]) -> str | None:
@@ -117,7 +117,7 @@ def hint_at_flags(recipe: str, changes: Sequence[str]) -> None:
     if changes:
         changed(recipe_named(recipe)(), changes)
         pairs = (change.split("=", 1) for change in changes)
-        said = " ".join(f"--{a.replace('_', '-')} {b.replace(',', ' ')}" for a, b in pairs)
+        said = " ".join(f"--{flag_of(a)} {b.replace(',', ' ')}" for a, b in pairs)
         warnings.warn(f"--change will go; write {said}", Hint, stacklevel=2)
 
 
@@ -132,25 +132,24 @@ def _flags(recipe: Any, taken: set[str], name: str) -> type:
     kinds, meanings = get_type_hints(type(recipe)), field_texts(type(recipe))
     fields: list[tuple[str, Any, Any]] = []
     for one in dataclasses.fields(recipe):
-        value = getattr(recipe, one.name)
-        if one.name in NOT_FLAGS:
-            continue
-        flag = tyro.conf.arg(
-            name=f"recipe.{one.name}" if one.name in taken else None, help=meanings.get(one.name)
-        )
-        fields.append(
-            (one.name, Annotated[kinds[one.name], flag], dataclasses.field(default=value))
-        )
+        flag = tyro.conf.arg(name=_flag(one.name, taken), help=meanings.get(one.name))
+        value = dataclasses.field(default=getattr(recipe, one.name))
+        fields.append((one.name, Annotated[kinds[one.name], flag], value))
     return dataclasses.make_dataclass(
         "Numbers", fields, frozen=True, namespace={"__doc__": f"Options of {name}."}
     )
 
 
-def _flag(option: str, taken: set[str]) -> str | None:
-    """The flag of an option; None for those that are none."""
-    if option in NOT_FLAGS:
-        return None
+def _flag(option: str, taken: set[str]) -> str:
+    """The flag of an option, which is longer where the command has one of the same name."""
     return f"recipe.{option}" if option in taken else option
+
+
+def flag_of(option: str) -> str:
+    """The flag of an option in `sharpfield train`, without the dashes in front."""
+    from sharpfield.cli.train import train_command
+
+    return _flag(option, _flags_of(_own_parameters(train_command))).replace("_", "-")
 
 
 def _flags_of(parameters: list[inspect.Parameter]) -> set[str]:

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from sharpfield.cli.recipe_options import flag_of
 from sharpfield.core.errors import OptionError
 from sharpfield.recipes import RECIPES, recipe_named, summaries, summary_of
 from sharpfield.recipes.settings.options import Option, options_of
@@ -44,10 +45,10 @@ def _described(name: str, recipe: Any) -> str:
         for option, after in options_of(change(recipe())).items():
             if option not in default or after.value != default[option].value:
                 before = _text(default[option]) if option in default else "none"
-                lines.append(f"      {option:<{COLUMN - 4}} {before} -> {_text(after)}")
-    lines += ["", f"options (train {name} CAPTURE --OPTION VALUE), with their defaults"]
+                lines.append(f"      --{flag_of(option):<{COLUMN - 4}} {before} -> {_text(after)}")
+    lines += ["", f"options of `sharpfield train {name}`, with their defaults"]
     for option in default.values():
-        lines.append(f"  {option.name:<{COLUMN}} {_text(option)}")
+        lines.append(f"  --{flag_of(option.name):<{COLUMN}} {_text(option)}")
         lines += textwrap.wrap(
             option.meaning, WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6
         )

@@ -5,6 +5,7 @@ A package of your own adds recipes by the entry point `sharpfield.recipes`.
 
 import ast
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -63,55 +64,63 @@ def summary_of(recipe: Any) -> str:
     return next(iter((recipe.__doc__ or "").strip().splitlines()), "")
 
 
-def names_in_source(name: str) -> tuple[set[str], set[str]] | None:
-    """Options of a recipe of our own, and old names of options with all other keys of its tables.
+@dataclass
+class SourceNames:
+    """What the source of a recipe says of itself, read without importing it."""
 
-    The source is read, not imported: what is in neither set is no option of the recipe.
-    """
+    options: set[str] = field(default_factory=set)
+    """Names of options; those of dataclasses in the recipe follow a dot."""
+    presets: set[str] = field(default_factory=set)
+    old: set[str] = field(default_factory=set)
+    """Old names of options and groups, with all other keys of tables."""
+
+
+def names_in_source(name: str) -> SourceNames | None:
+    """The options and presets of a recipe of our own; None for those of other packages."""
     if name not in OWN:
         return None
-    module, class_name = OWN[name].split(":")
-    mentioned: set[str] = set()
-    return set(_fields_in_source(module, class_name, mentioned)), mentioned
+    found = SourceNames()
+    module, _, kind = OWN[name].partition(":")
+    found.options |= set(_fields_in_source(module, kind, found))
+    return found
 
 
-def _fields_in_source(module: str, name: str, mentioned: set[str]) -> Iterator[str]:
-    """Names of the fields of a dataclass; keys of tables in its module are added to `mentioned`."""
+def _fields_in_source(module: str, name: str, found: SourceNames) -> Iterator[str]:
+    """Names of the fields of a dataclass; the keys of tables in its module go to `found`."""
     tree = _source(module)
-    mentioned |= {
-        key.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Dict)
-        for key in node.keys
-        if isinstance(key, ast.Constant) and isinstance(key.value, str)
-    }
-    found_in = {
+    found.old |= _keys(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            found.presets |= _keys(node) if node.func.id == "Presets" else set()
+    homes = {
         alias.asname or alias.name: (node.module or "", alias.name)
         for node in tree.body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    for imported, _ in found_in.values():  # tables of old names may be elsewhere
-        if imported.endswith(".renamed"):
-            list(_fields_in_source(imported, "", mentioned))
-    definitions = [node for node in tree.body if isinstance(node, ast.ClassDef)]
-    for node in (one for one in definitions if one.name == name):
-        for base in node.bases:
-            if isinstance(base, ast.Name):
-                yield from _fields_in_source(
-                    *found_in.get(base.id, (module, base.id)), mentioned=mentioned
-                )
-        for field in node.body:
-            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                yield field.target.id
-                kind = field.annotation
-                if isinstance(kind, ast.Name) and (
-                    kind.id in found_in or kind.id in {one.name for one in definitions}
-                ):
-                    where, inner = found_in.get(kind.id, (module, kind.id))
-                    if where.startswith("sharpfield."):
-                        inside = _fields_in_source(where, inner, mentioned)
-                        yield from (f"{field.target.id}.{option}" for option in inside)
+    for imported in {module for module, _ in homes.values() if module.endswith(".renamed")}:
+        found.old |= _keys(_source(imported))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    homes |= {one: (module, one) for one in classes}
+    if name not in classes:
+        return
+    for base in classes[name].bases:
+        if isinstance(base, ast.Name) and homes.get(base.id, ("", ""))[0].startswith("sharpfield."):
+            yield from _fields_in_source(*homes[base.id], found)
+    for node in classes[name].body:
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            yield node.target.id
+            kind = node.annotation.id if isinstance(node.annotation, ast.Name) else ""
+            if homes.get(kind, ("", ""))[0].startswith("sharpfield."):
+                inside = _fields_in_source(*homes[kind], found)
+                yield from (f"{node.target.id}.{option}" for option in inside)
+
+
+def _keys(tree: ast.AST) -> set[str]:
+    """Texts that are keys of dictionaries."""
+    tables = (node for node in ast.walk(tree) if isinstance(node, ast.Dict))
+    keys = (key.value for table in tables for key in table.keys if isinstance(key, ast.Constant))
+    return {key for key in keys if isinstance(key, str)}
 
 
 def _source(module: str) -> ast.Module:

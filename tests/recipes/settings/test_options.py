@@ -73,8 +73,9 @@ def test_every_option_of_every_recipe_has_a_meaning(name: str) -> None:
         assert (change.__doc__ or "").strip(), preset
         assert options_of(change(recipe)).keys()
     found = names_in_source(name)
-    assert found is not None and options_of(recipe).keys() <= found[0]
-    assert {*getattr(recipe, "renamed", {})} <= found[1]
+    assert found is not None and {*recipe.presets.all, *recipe.presets.renamed} <= found.presets
+    assert found is not None and options_of(recipe).keys() <= found.options
+    assert {*getattr(recipe, "renamed", {})} <= found.old
     assert set(getattr(recipe, "renamed", {}).values()) <= {
         *options_of(recipe),
         *(one.rpartition(".")[0] for one in options_of(recipe)),
