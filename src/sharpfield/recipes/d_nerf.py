@@ -19,31 +19,12 @@ from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
 from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
-
-PAPER = Paper(
-    key="pumarola2021dnerf",
-    title="D-NeRF: Neural Radiance Fields for Dynamic Scenes",
-    bibtex="""@inproceedings{pumarola2021dnerf,
-  title     = {{D-NeRF}: Neural Radiance Fields for Dynamic Scenes},
-  author    = {Pumarola, Albert and Corona, Enric and Pons-Moll, Gerard and
-               Moreno-Noguer, Francesc},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2021}
-}""",
-    departures=(
-        "The scene is linear light, and frames are encoded by their own response.",
-        "Pixels are drawn from all frames at once; the published code draws them from one frame"
-        " and opens later and later frames.",
-        "There is no term for the total variation of displacements, which published configurations"
-        " leave out.",
-        "Blurred frames may be explained by several instants of the exposure (`instants`).",
-    ),
-)
 
 
 def draft(recipe: "DNeRF") -> "DNeRF":
@@ -67,7 +48,7 @@ def published(recipe: "DNeRF") -> "DNeRF":
 class DNeRF:
     """A dynamic scene from frames: a canonical radiance field and a deformation field."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("d-nerf")
     renamed: ClassVar[dict[str, str]] = {"rate": "lr", "decay": "lr_decay_steps"}
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}

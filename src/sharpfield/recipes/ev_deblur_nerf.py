@@ -20,6 +20,7 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.core.tone import tone_of
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.event_term import EventOptions, EventTerm
 from sharpfield.recipes.volume.frame_terms import (
@@ -40,41 +41,6 @@ from sharpfield.recipes.volume.scene import (
     VolumeOptions,
     stages,
 )
-
-PAPER = Paper(
-    key="cannici2024evdeblurnerf",
-    title="Mitigating Motion Blur in Neural Radiance Fields with Events and Frames",
-    bibtex="""@inproceedings{cannici2024evdeblurnerf,
-  title     = {Mitigating Motion Blur in Neural Radiance Fields with Events and Frames},
-  author    = {Cannici, Marco and Scaramuzza, Davide},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2024}
-}""",
-    departures=(
-        "The direction's encoding enters the first colour layer once per ray instead of being"
-        " repeated for every sample: the same numbers, less work.",
-        "Samples are sorted after the networks, not before: the same numbers.",
-        "The kernel network runs once for each image, not for each ray: the same numbers.",
-        "A learned camera response is fitted to the identity by the same rule but with our own"
-        " random numbers.",
-        "The share of the adaptive weights is a function of the iteration, so resuming does not"
-        " reset it to its first value.",
-        "Without a prior the frames count from the first iteration, as nothing else would hold"
-        " colours.",
-        "A resumed run does not repeat the iteration of its checkpoint.",
-        "Event times in nanoseconds are rounded to microseconds once, on reading.",
-        "The learned camera response starts with its polarity inputs switched off (released: random"
-        " columns, so that the response jumps when it begins), from first weights that a fixed seed"
-        " chooses because half of all seeds fit the identity badly near black.",
-        "The event term is computed in float32; the released code computes it in float64.",
-        "Accumulated events are drawn from a fixed range; the released annealing is not offered.",
-        "The gamma curve is straight below 1e-5, where its slope would be infinite.",
-        "Frames look from the trajectory at mid-exposure unless their own pose is more than a pixel"
-        " off; the released code always takes their own.",
-        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light.",
-    ),
-)
-
 
 NETWORK_RATE = 5e-3
 """Learning rate of the networks beside a dense grid: the published one."""
@@ -180,7 +146,7 @@ def variant_for(capture: Capture, size: str) -> str:
 class EvDeblurNeRF:
     """A sharp static scene from blurry frames and events. Defaults: the paper's synthetic data."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("ev-deblur-nerf")
     renamed: ClassVar[dict[str, str]] = {
         "rate": "lr",
         "decay": "lr_decay_steps",

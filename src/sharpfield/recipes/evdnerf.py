@@ -23,6 +23,7 @@ from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.scene import stages
@@ -32,31 +33,6 @@ from sharpfield.storage.event_cache import event_index
 
 FLOOR = 1e-10
 """Light added before the logarithm."""
-
-PAPER = Paper(
-    key="bhattacharya2024evdnerf",
-    title="EvDNeRF: Reconstructing Event Data with Dynamic Neural Radiance Fields",
-    bibtex="""@inproceedings{bhattacharya2024evdnerf,
-  title     = {{EvDNeRF}: Reconstructing Event Data with Dynamic Neural Radiance Fields},
-  author    = {Bhattacharya, Anish and Madaan, Ratnesh and Cladera, Fernando and
-               Vemprala, Sai and Bonatti, Rogerio and Daniilidis, Kostas and
-               Kapoor, Ashish and Kumar, Vijay and Matni, Nikolai and Gupta, Jayesh K.},
-  booktitle = {IEEE/CVF Winter Conference on Applications of Computer Vision (WACV)},
-  year      = {2024}
-}""",
-    departures=(
-        "Events are counted in whole numbers at full resolution; the released code halves its data"
-        " and rounds sums of thresholds downwards (`halved`).",
-        "Event frames without events are not drawn where an event is wanted; the released code"
-        " shifts the pairing of pixels and frames from the first of them on.",
-        "The first step of each stage has the rate of its schedule, not the full one.",
-        "One run goes through all stages and keeps the moments of Adam; the released code is"
-        " started once for each.",
-        "Samples lie between two distances along the ray; the released code takes planar depths.",
-        "Left out on purpose: image loss, distortion loss, sawtooth times and count batches, which"
-        " no published configuration switches on.",
-    ),
-)
 
 
 @dataclass(frozen=True)
@@ -133,7 +109,7 @@ def published(recipe: "EvDNeRF") -> "EvDNeRF":
 class EvDNeRF:
     """A dynamic scene from events of static cameras. Defaults: the paper's simulated scenes."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("evdnerf")
     renamed: ClassVar[dict[str, str]] = {
         "rate": "lr",
         "one_scale": "fixed_scale",

@@ -28,17 +28,13 @@ from sharpfield.formation.response import FixedResponse
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes import evdnerf
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import Terms
 from sharpfield.recipes.volume.voxel_scene import MovingOptions, MovingScene
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table
 from sharpfield.sampling.windows import Lengths, draw_spans, draw_windows
 from sharpfield.storage.event_cache import event_index
-
-PAPER = replace(
-    evdnerf.PAPER, key="sharpfield-evdnerf-physical", title="EvDNeRF made physical", departures=()
-)
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ def standard(recipe: "EvDNeRFPhysical") -> "EvDNeRFPhysical":
 class EvDNeRFPhysical:
     """A dynamic scene from exactly counted events, and from frames if there are any."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("evdnerf-physical")
     renamed: ClassVar[dict[str, str]] = {
         "rate": "lr",
         "decay": "lr_decay_steps",

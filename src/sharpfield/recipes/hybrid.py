@@ -29,45 +29,8 @@ from sharpfield.recipes.points.hybrid_checkpoint import load_released
 from sharpfield.recipes.points.images import ImageBranch, SourceOptions
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import PointScene
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-
-PAPER = Paper(
-    key="dai2023hybrid",
-    title="Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur",
-    bibtex="""@inproceedings{dai2023hybrid,
-  title     = {Hybrid Neural Rendering for Large-Scale Scenes with Motion Blur},
-  author    = {Dai, Peng and Zhang, Yinda and Yu, Xin and Lyu, Xiaoyang and Qi, Xiaojuan},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2023}
-}""",
-    departures=(
-        "Neighbours are the nearest in the window of cells; the released code stops at the first"
-        " layer of cells that holds enough, drops points at random where a cell is full, and gives"
-        " its first occupied cell no points.",
-        "Descriptors start at random, and networks by Xavier's rule; the released code starts them"
-        " from weights trained on another data set for a day. Such a checkpoint can be loaded"
-        " (`checkpoint`).",
-        "Depth of held-out frames is not used unless cloud.frames is `all`, as published.",
-        "The regulariser of confidence leaves out empty slots, which the released code fills with"
-        " the first point.",
-        "Rows of points that a step does not touch are left alone; the released code moves all by"
-        " the momentum of Adam. Nothing restarts when points grow.",
-        "Maps of features are read at their own size, which gives the same numbers as enlarging"
-        " them first.",
-        "Samples behind the camera of an image, or a little outside of it, are invisible in it.",
-        "Rays that miss are left out of a patch before it is blurred; the released code blurs the"
-        " background into their neighbours.",
-        "Which patches are rendered without images is random in each step; the released code always"
-        " takes the same slots, whose positions in the image are random.",
-        "New points in one round of growth all get the same share of their neighbours' confidence;"
-        " in the released code those of earlier frames get powers of it.",
-        "Points from depth are voxel means at pixel centres; the released code takes the point"
-        " nearest the mean, and is off by half a pixel.",
-        "In evaluation, the camera's axes are those of the frame nearest in time, and colour is"
-        " left out where a sample sends less than 1e-4 of a ray's light.",
-    ),
-)
-
 
 RENAMED = {
     **point_nerf.RENAMED,
@@ -159,7 +122,7 @@ def _by_pose_and_depth(recipe: "Hybrid") -> "Hybrid":
 class Hybrid(PointNeRF):
     """Neural points with features of nearby images, from blurry video with depth."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("hybrid")
     renamed: ClassVar[dict[str, str]] = RENAMED
     presets: ClassVar[Presets] = Presets(
         variants={"h-only": h_only, "rooms": rooms, "learned": learned, "no-images": no_images},

@@ -17,26 +17,10 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.core.tone import tone_of
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.volume.frame_terms import FrameOptions, KernelTerm, Terms
 from sharpfield.recipes.volume.scene import DRAFT, GRID_RATE, STANDARD, Volume, VolumeOptions
-
-PAPER = Paper(
-    key="mildenhall2020nerf",
-    title="NeRF: Representing Scenes as Neural Radiance Fields for View Synthesis",
-    bibtex="""@inproceedings{mildenhall2020nerf,
-  title     = {{NeRF}: Representing Scenes as Neural Radiance Fields for View Synthesis},
-  author    = {Mildenhall, Ben and Srinivasan, Pratul P. and Tancik, Matthew and
-               Barron, Jonathan T. and Ramamoorthi, Ravi and Ng, Ren},
-  booktitle = {European Conference on Computer Vision (ECCV)},
-  year      = {2020}
-}""",
-    departures=(
-        "The scene is linear light and frames are encoded by their own response; the published"
-        " code works on stored values throughout.",
-        "In evaluation, colour is left out where a sample sends less than 1e-4 of a ray's light.",
-    ),
-)
 
 
 def draft(recipe: "NeRF") -> "NeRF":
@@ -61,7 +45,7 @@ def published(recipe: "NeRF") -> "NeRF":
 class NeRF:
     """A radiance field of frames taken as sharp. The baseline of the volume recipes."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("nerf")
     renamed: ClassVar[dict[str, str]] = {
         "rate": "lr",
         "decay": "lr_decay_steps",

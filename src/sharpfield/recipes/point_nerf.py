@@ -14,32 +14,10 @@ from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import MarchOptions, PointScene
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 
 R = TypeVar("R", bound="PointNeRF")
-
-PAPER = Paper(
-    key="xu2022pointnerf",
-    title="Point-NeRF: Point-based Neural Radiance Fields",
-    bibtex="""@inproceedings{xu2022pointnerf,
-  title     = {{Point-NeRF}: Point-based Neural Radiance Fields},
-  author    = {Xu, Qiangeng and Xu, Zexiang and Philip, Julien and Bi, Sai and Shu, Zhixin and
-               Sunkavalli, Kalyan and Neumann, Ulrich},
-  booktitle = {IEEE/CVF Conference on Computer Vision and Pattern Recognition (CVPR)},
-  year      = {2022}
-}""",
-    departures=(
-        "Neighbours are the nearest in the window of cells; the released code stops at the first"
-        " layer of cells that holds enough, and drops points at random where a cell is full.",
-        "Descriptors start at random; the released code starts them, and the networks, from"
-        " weights trained on another data set for a day.",
-        "The regulariser of confidence leaves out empty slots, which the released code fills with"
-        " the first point.",
-        "Rows of points that a step does not touch are left alone; the released code moves all by"
-        " the momentum of Adam.",
-        "Steps are uneven by the seed and step, so a run can be repeated.",
-    ),
-)
 
 
 RENAMED = {
@@ -121,7 +99,7 @@ def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, samp
 class PointNeRF:
     """Neural points from depth; frames are taken as sharp. The baseline of `hybrid`."""
 
-    paper: ClassVar[Paper] = PAPER
+    paper: ClassVar[Paper] = paper_of("point-nerf")
     renamed: ClassVar[dict[str, str]] = RENAMED
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}

@@ -16,8 +16,8 @@ from sharpfield.core.paper import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
 from sharpfield.initialisation.posed_images import sharp_light_images
+from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.splats import papers
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
 from sharpfield.recipes.splats.scene import GaussianOptions, MotionOptions
@@ -105,7 +105,7 @@ def standard(recipe: R) -> R:
 class Splat:
     """Gaussians from frames taken as sharp. The baseline of the fast recipes."""
 
-    paper: ClassVar[Paper] = papers.KERBL
+    paper: ClassVar[Paper] = paper_of("splat")
     presets: ClassVar[Presets] = Presets({"refine": refine}, {"draft": draft, "standard": standard})
     renamed: ClassVar[dict[str, str]] = RENAMED
 
@@ -143,7 +143,7 @@ class Splat:
 class EdiSplat(Splat):
     """Gaussians from frames deblurred with events first. The baseline everyone must beat."""
 
-    paper: ClassVar[Paper] = papers.PAN
+    paper: ClassVar[Paper] = paper_of("edi-splat")
 
     def build(self, capture: Capture, seed: int) -> SplatModel:
         """On the deblurred frames."""
@@ -154,7 +154,7 @@ class EdiSplat(Splat):
 class BlurSplat(Splat):
     """Gaussians and the motion of the camera inside each exposure, from blurry frames alone."""
 
-    paper: ClassVar[Paper] = papers.ZHAO
+    paper: ClassVar[Paper] = paper_of("blur-splat")
 
     sampling: SamplingOptions = field(
         default_factory=lambda: SamplingOptions(
@@ -170,7 +170,7 @@ class BlurSplat(Splat):
 class EventSplat(Splat):
     """Gaussians from events alone; brightness is known up to a gain and an offset."""
 
-    paper: ClassVar[Paper] = papers.XIONG
+    paper: ClassVar[Paper] = paper_of("event-splat")
 
     sampling: SamplingOptions = field(
         default_factory=lambda: SamplingOptions(latent_weight=0.0, event_weight=0.04)
@@ -186,7 +186,7 @@ class EventSplat(Splat):
 class EvSplat(Splat):
     """Gaussians from blurry frames and events: first latent frames, then both as measured."""
 
-    paper: ClassVar[Paper] = papers.OURS
+    paper: ClassVar[Paper] = paper_of("ev-splat")
 
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
 
@@ -201,7 +201,7 @@ class RoomSplat(Splat):
     give latent frames.
     """
 
-    paper: ClassVar[Paper] = papers.DAI
+    paper: ClassVar[Paper] = paper_of("room-splat")
 
     gaussians: GaussianOptions = field(default_factory=lambda: GaussianOptions(density=1.5))
     sampling: SamplingOptions = field(
@@ -230,7 +230,7 @@ def moving_standard(recipe: "DynamicSplat") -> "DynamicSplat":
 class DynamicSplat(Splat):
     """Static and moving Gaussians from frames alone. The baseline of moving scenes."""
 
-    paper: ClassVar[Paper] = papers.LI
+    paper: ClassVar[Paper] = paper_of("dynamic-splat")
     presets: ClassVar[Presets] = Presets(
         {"refine": refine}, {"draft": moving_draft, "standard": moving_standard}
     )
@@ -258,7 +258,7 @@ class DynamicSplat(Splat):
 class EvDynamicSplat(DynamicSplat):
     """Static and moving Gaussians from events, and frames, sharp or blurred, if there are any."""
 
-    paper: ClassVar[Paper] = papers.OURS_MOVING
+    paper: ClassVar[Paper] = paper_of("ev-dynamic-splat")
 
     sampling: SamplingOptions = field(
         default_factory=lambda: SamplingOptions(
