@@ -4,7 +4,7 @@ import torch
 from sharpfield.core.protocols import Field, Head, Renderer, Trajectory
 from sharpfield.core.seed import generator
 from sharpfield.fields.mlp import MLPField
-from sharpfield.geometry.space import Metric, Similarity
+from sharpfield.geometry.space import EvenDepth, Similarity
 from sharpfield.geometry.trajectory import BSpline, LearnedKnots, Moved, Stamped, Still, Tracks
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from tests.core.test_capture import CLOCK, Rail, capture
@@ -31,7 +31,7 @@ def test_fields_heads_and_renderers():
     field = MLPField(generator=generator(0, 0, "field"), width=4, depth=2)
     made = capture()
     assert isinstance(field, Field) and isinstance(field.coarse, Head)
-    assert isinstance(CoarseToFine(field, Metric(made.camera, 1.0, 2.0)), Renderer)
+    assert isinstance(CoarseToFine(field, EvenDepth(made.camera, 1.0, 2.0)), Renderer)
 
 
 def test_others_do_not_pass():

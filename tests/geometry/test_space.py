@@ -6,8 +6,8 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Rays
 from sharpfield.geometry import se3
 from sharpfield.geometry.space import (
+    EvenDepth,
     Frustum,
-    Metric,
     Similarity,
     average_pose,
     forward_facing,
@@ -73,14 +73,14 @@ def test_ndc_sees_neither_length_nor_start_of_a_ray():
 
 
 def test_a_metric_space_changes_nothing():
-    rays, space = ahead(5), Metric(DAVIS, 1.0, 4.0)
+    rays, space = ahead(5), EvenDepth(DAVIS, 1.0, 4.0)
     assert space.warp(rays) == (rays.origin, rays.direction)
     assert torch.equal(space.depth(rays.time), rays.time)
 
 
 def test_a_metric_box_holds_what_the_corners_see():
     seen = poses(6, turn=0.4)
-    low, high = Metric(DAVIS, 0.5, 4.0).box(seen)
+    low, high = EvenDepth(DAVIS, 0.5, 4.0).box(seen)
     corners = torch.tensor([[0, 0], [345, 0], [0, 259], [345, 259]], dtype=torch.float64)
     for pose in seen:
         for z in (0.5, 4.0):

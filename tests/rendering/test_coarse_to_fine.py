@@ -10,7 +10,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
 from sharpfield.geometry.rays import cast
-from sharpfield.geometry.space import Frustum, Metric
+from sharpfield.geometry.space import EvenDepth, Frustum
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.head_compositing import Compositing
 
@@ -63,7 +63,7 @@ def rays(*shape: int) -> Rays:
 
 
 def renderer(samples: tuple[int, int] = (64, 64), **change) -> CoarseToFine:
-    return CoarseToFine(Slab(), Metric(CAMERA, 0.5, 4.0), samples, how=OPEN, **change)
+    return CoarseToFine(Slab(), EvenDepth(CAMERA, 0.5, 4.0), samples, how=OPEN, **change)
 
 
 def closed_form(rays: Rays) -> tuple[Tensor, Tensor]:
@@ -154,7 +154,7 @@ def test_noise_is_only_for_training():
     view, seen = renderer(noise=50.0), rays(40)
     torch.testing.assert_close(view(seen).rgb, renderer(noise=0.0)(seen).rgb)
     noisy, quiet = (
-        CoarseToFine(Slab(), Metric(CAMERA, 0.5, 4.0), noise=noise, how=OPEN)(
+        CoarseToFine(Slab(), EvenDepth(CAMERA, 0.5, 4.0), noise=noise, how=OPEN)(
             seen, generator(0, 0, "samples")
         )
         for noise in (50.0, 0.0)

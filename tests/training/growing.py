@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sharpfield.core.measurements import Batch
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.schedule import Group, constant
 from sharpfield.core.seed import generator
 from tests.training.toy import Toy

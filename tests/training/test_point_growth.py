@@ -5,8 +5,7 @@ import torch
 from torch import nn
 
 from sharpfield.core.errors import RunError
-from sharpfield.core.points import Growth, unchanged
-from sharpfield.core.protocols import Growing, PointSet
+from sharpfield.core.protocols import Growing, Growth, PointSet, unchanged
 from sharpfield.training.checkpoint import (
     TrainingProgress,
     file_of,

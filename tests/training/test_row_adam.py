@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from sharpfield.core.points import Growth
+from sharpfield.core.protocols import Growth
 from sharpfield.ops.sparse_rows import take_rows
 from sharpfield.training.optim import ROW_STEPS, RowAdam
 from sharpfield.training.point_growth import apply_growth

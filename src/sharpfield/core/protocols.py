@@ -6,14 +6,15 @@ sensor reports, and a `Recipe` builds a `Model` from these for one capture.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar, runtime_checkable
 
-from jaxtyping import Float, Int64
+import torch
+from jaxtyping import Bool, Float, Int64
 from torch import Generator, Tensor
 
 from sharpfield.core.measurements import Batch, EventPairs
 from sharpfield.core.paper import Paper
-from sharpfield.core.points import Growth
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
 
@@ -161,6 +162,32 @@ class Model(Protocol):
     def groups(self) -> list[Group]:
         """Parameters with their learning rates."""
         ...
+
+
+@dataclass(frozen=True)
+class Growth:
+    """The next set of m points, made from the present one of n: which are kept, copied or new.
+
+    A *point* is an element of a scene with one row in each of several tensors: a Gaussian, a neural
+    point. Pruning, cloning, splitting and relocating points are all the same operation.
+    """
+
+    source: Int64[Tensor, "m"]
+    """The row that each point is a copy of."""
+    fresh: Bool[Tensor, "m"]
+    """Points whose optimizer state is reset."""
+    values: dict[str, Float[Tensor, "m ..."]] = field(default_factory=dict[str, Tensor])
+    """Tensors by name that are not just copied; rows equal to their source's stay as they are."""
+
+    def __len__(self) -> int:
+        """Number of points afterwards."""
+        return len(self.source)
+
+
+def unchanged(count: int, device: torch.device | str = "cpu") -> Growth:
+    """The growth that changes nothing; give it `values` to set some of them."""
+    every = torch.arange(count, device=device)
+    return Growth(every, torch.zeros_like(every, dtype=torch.bool))
 
 
 @runtime_checkable

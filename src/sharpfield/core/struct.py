@@ -8,10 +8,11 @@ project besides `nn.Module`, `Protocol` and `Exception`.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any, ClassVar, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 S = TypeVar("S", bound="Struct")
 """Not `Self`: beartype checks methods one by one and cannot resolve it there."""
@@ -111,3 +112,11 @@ def one_line(record: Any) -> str:
             text = repr(value) if shape is None or isinstance(value, Struct) else str([*shape])
             shown.append(f"{field.name}={text}")
     return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def device_of(part: object) -> torch.device:
+    """The device of a module's tensors; the CPU if it is no module, or has none."""
+    if not isinstance(part, nn.Module):
+        return torch.device("cpu")
+    held = next(chain(part.parameters(), part.buffers()), None)
+    return torch.device("cpu") if held is None else held.device

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.protocols import Model
+from sharpfield.core.struct import device_of
 from sharpfield.core.tone import luma
 from sharpfield.events.image import window_image
 from sharpfield.events.index import EventIndex

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float, Float32, Int64
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError
+from sharpfield.core.struct import device_of
 from sharpfield.geometry.normalise import focus
 from sharpfield.geometry.space import average_pose, forward_facing
 from sharpfield.geometry.trajectory import Stamped

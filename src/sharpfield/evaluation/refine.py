@@ -25,10 +25,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Model
 from sharpfield.core.seed import numpy_generator
+from sharpfield.core.struct import device_of
 from sharpfield.evaluation.options import Refinement
 from sharpfield.evaluation.views import held_out
 from sharpfield.geometry import se3

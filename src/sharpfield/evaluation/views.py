@@ -17,11 +17,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.frames import Frames
 from sharpfield.core.protocols import Model
 from sharpfield.core.seed import evenly_spread
+from sharpfield.core.struct import device_of
 from sharpfield.evaluation.brightness import Brightness, fit_brightness
 from sharpfield.geometry.rolling import Rolling, moved_rows
 from sharpfield.metrics.image import psnr

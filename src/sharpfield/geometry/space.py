@@ -136,7 +136,7 @@ class Frustum:
 
 
 @dataclass(frozen=True)
-class Metric:
+class EvenDepth:
     """A volume sampled evenly in distance between two depths."""
 
     camera: Camera
@@ -158,7 +158,7 @@ class Metric:
         return torch.stack([ends.amin(0), ends.amax(0)])
 
 
-Space = Frustum | Metric
+Space = Frustum | EvenDepth
 
 
 def _corner_rays(camera: Camera, poses: Float[Tensor, "n 3 4"]) -> tuple[Tensor, Tensor]:

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.progress import track
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.events import EventStream
 from sharpfield.core.progress import progress_on
+from sharpfield.core.struct import device_of
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.options import Refinement
 from sharpfield.evaluation.paths import camera_path

@@ -13,9 +13,9 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError, ShapeError
 from sharpfield.core.rays import Radiance
+from sharpfield.core.struct import device_of
 from sharpfield.geometry.normalise import change_of
 from sharpfield.geometry.rolling import Rolling
 from sharpfield.geometry.trajectory import count_tracks

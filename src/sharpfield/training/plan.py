@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from sharpfield.core.device import device_of
 from sharpfield.core.protocols import Model
+from sharpfield.core.struct import device_of
 from sharpfield.training.loop import fit
 from sharpfield.training.memory import GIB, MEMORY_FRACTION, available_bytes, plan_micro_batches
 from sharpfield.training.optim import adam

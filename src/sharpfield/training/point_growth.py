@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 
 
 def apply_growth(part: PointSet, optimizer: Optimizer, growth: Growth) -> None:

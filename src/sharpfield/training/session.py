@@ -12,9 +12,9 @@ from typing import Any
 
 from rich.console import Console
 
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.protocols import Model
+from sharpfield.core.struct import device_of
 from sharpfield.training.checkpoint import (
     Checkpoint,
     TrainingProgress,

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from torch.optim import Optimizer
 
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import RunError
 from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
+from sharpfield.core.struct import device_of
 from sharpfield.training.checkpoint import TrainingProgress, save_best, save_last
 from sharpfield.training.log import TrainingLog
 from sharpfield.training.loop import Hook

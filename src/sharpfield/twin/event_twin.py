@@ -27,10 +27,10 @@ from jaxtyping import Float32, Float64, Int64
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
-from sharpfield.core.device import device_of
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.events import EventStream
 from sharpfield.core.protocols import Model, Trajectory
+from sharpfield.core.struct import device_of
 from sharpfield.geometry.normalise import change_of
 from sharpfield.geometry.trajectory import Moved, Stamped, count_tracks
 from sharpfield.rendering.view import Progress, ViewRenderer, render_view, renderer_of

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from sharpfield.core.points import Growth
+from sharpfield.core.protocols import Growth
 from sharpfield.core.seed import generator
 from sharpfield.fields.gaussians.mcmc import (
     MIN_OPACITY,

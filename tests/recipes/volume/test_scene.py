@@ -9,7 +9,7 @@ from sharpfield.core.schedule import constant
 from sharpfield.core.seed import generator
 from sharpfield.geometry import se3
 from sharpfield.geometry.rays import cast
-from sharpfield.geometry.space import Frustum, Metric, average_pose
+from sharpfield.geometry.space import EvenDepth, Frustum, average_pose
 from sharpfield.geometry.trajectory import Still
 from sharpfield.recipes.volume.scene import Volume, VolumeOptions, stages
 
@@ -64,8 +64,8 @@ def test_it_sees_the_capture_in_its_own_space(tiny: Capture):
 
 def test_the_space_follows_the_cameras(tiny: Capture):
     assert isinstance(volume(tiny).space, Frustum)
-    assert isinstance(volume(ring(tiny)).space, Metric)
-    assert isinstance(volume(tiny, space="metric").space, Metric)
+    assert isinstance(volume(ring(tiny)).space, EvenDepth)
+    assert isinstance(volume(tiny, space="metric").space, EvenDepth)
     assert isinstance(volume(ring(tiny), space="ndc").space, Frustum)
 
 

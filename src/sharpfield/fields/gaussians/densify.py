@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Generator, Tensor, nn
 
-from sharpfield.core.points import Growth, unchanged
+from sharpfield.core.protocols import Growth, unchanged
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry.se3 import rotation_from_quaternion
 

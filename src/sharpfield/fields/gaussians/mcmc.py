@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Generator, Tensor
 
-from sharpfield.core.points import Growth
+from sharpfield.core.protocols import Growth
 from sharpfield.fields.gaussians.static import Gaussians
 
 MIN_OPACITY = 0.005

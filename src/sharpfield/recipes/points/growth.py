@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from sharpfield.core.points import Growth
+from sharpfield.core.protocols import Growth
 from sharpfield.core.seed import numpy_generator
 from sharpfield.fields.points.cloud import LEAST_CONFIDENCE, NeuralPoints
 from sharpfield.fields.points.networks import shares

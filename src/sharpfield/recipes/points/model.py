@@ -17,8 +17,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, Pixels
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator

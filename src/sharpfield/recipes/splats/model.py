@@ -18,8 +18,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
 from sharpfield.core.seed import generator

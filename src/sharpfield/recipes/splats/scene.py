@@ -14,8 +14,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.core.schedule import Group, Schedule, constant, exponential, scaled
 from sharpfield.core.tone import Tone

@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.core.points import Growth
-from sharpfield.core.protocols import PointSet
+from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields.gaussians.densify import GradientStats, densify, reset_opacity

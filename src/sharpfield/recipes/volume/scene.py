@@ -17,7 +17,7 @@ from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.plane_grid import HeadSize, PlaneField
 from sharpfield.fields.voxels import VoxelField, shapes_in
 from sharpfield.geometry.normalise import normalised, reference_poses
-from sharpfield.geometry.space import Frustum, Metric, Space, forward_facing
+from sharpfield.geometry.space import EvenDepth, Frustum, Space, forward_facing
 from sharpfield.losses.regularizers import smoothness
 from sharpfield.ops.grid import total_variation
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
@@ -186,7 +186,7 @@ def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space
     in_frustum = options.space == "ndc" or (options.space == "auto" and forward_facing(poses))
     if in_frustum:
         return Frustum(capture.camera)
-    return Metric(capture.camera, capture.near, capture.far)
+    return EvenDepth(capture.camera, capture.near, capture.far)
 
 
 def _seen_from(capture: Capture, poses: Float[np.ndarray, "n 3 4"]) -> Float[Tensor, "m 3 4"]:

@@ -17,7 +17,7 @@ from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.warp import AtZero, Deformation, Warped
-from sharpfield.geometry.space import Metric
+from sharpfield.geometry.space import EvenDepth
 from sharpfield.recipes.volume.scene import soft
 from sharpfield.rendering.coarse_to_fine import CoarseToFine
 from sharpfield.rendering.head_compositing import Compositing
@@ -81,7 +81,7 @@ class WarpedScene(nn.Module):
         )
         self.field = Warped(canonical, deformation)
         how = Compositing(ACTIVATIONS[options.density], opaque_end=options.opaque_end)
-        space = Metric(capture.camera, capture.near, capture.far)
+        space = EvenDepth(capture.camera, capture.near, capture.far)
         self.view = CoarseToFine(self.field, space, options.samples, 0.0, how)
 
     @property
