@@ -1,7 +1,4 @@
-"""Arguments that several commands take, and how they are read.
-
-The terminal as all commands use it.
-"""
+"""Arguments that several commands take, and the terminal they print to."""
 
 from typing import Annotated, Literal
 
@@ -29,5 +26,5 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def screen() -> Console:
-    """Where commands print; numbers in a text are not coloured."""
+    """The terminal; numbers in a text are not coloured."""
     return Console(highlight=False)

@@ -1,4 +1,4 @@
-"""The command that trains a long capture in blocks: here, or shared out by torchrun."""
+"""`sharpfield blocks`: train a long capture in blocks, in one process or under torchrun."""
 
 import os
 from collections.abc import Mapping
@@ -19,10 +19,10 @@ from sharpfield.training.options import TrainingOptions
 
 @dataclass(frozen=True)
 class BlockSelection(Selection):
-    """What of the recipe, and of the capture, is used, and in how many blocks."""
+    """Presets of the recipe, the streams to train on, and the number of blocks."""
 
     count: int = 2
-    """Blocks that the capture is cut into."""
+    """Number of blocks that the capture is divided into."""
 
 
 SELECTION = BlockSelection()
@@ -40,15 +40,15 @@ def blocks_command(
 ) -> None:
     """Train a long capture in overlapping blocks, and merge them into one run.
 
-    The same command goes on where an earlier one stopped. To train blocks side by side, start it by
-    torchrun, which restarts workers that die:
+    The same command continues where an earlier one stopped. To train blocks in parallel, start it
+    with torchrun, which restarts workers that die:
     `torchrun --nproc-per-node 2 --max-restarts 3 --no-python sharpfield blocks ...`.
 
     Args:
-        recipe: One of those made of Gaussians, such as room-splat.
+        recipe: Name of a recipe on Gaussians, such as room-splat.
         capture: Folder of the capture.
         out: Folder of the merged run; the blocks' own runs are in it.
-        device: Where to train.
+        device: Device to train on.
         selection: Presets, streams, blocks, seed.
         training: How long, how often to save, how much memory; for each block.
         reading: How to read the capture, where its layout is wrong or silent.

@@ -20,10 +20,10 @@ def calibrate_command(
     """Measure the thresholds of the event camera from frames and events, and find odd pixels.
 
     Args:
-        capture: Folder of the capture; its poses are not looked at.
+        capture: Folder of the capture; its poses are ignored.
         out: Folder for `calibration.json`, `pixels.npz` and `pixels.png`.
         write_capture: Also write the capture, with the thresholds found, to this folder.
-        options: How much to look at.
+        options: Exposure pairs, random seed.
     """
     from sharpfield.captures.native import layout as native
     from sharpfield.captures.read import read_capture

@@ -1,4 +1,4 @@
-"""`sharpfield poses`: find where the camera was, or attach what something else says of it."""
+"""`sharpfield poses`: estimate camera poses, or attach those of another program."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,20 +23,20 @@ REPORT, PAGE = "poses.json", "poses.html"
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Poses that another program, a tracker or an encoder knows."""
+    """Poses from another program, a tracker or an encoder."""
 
     trajectory: Path | None = None
-    """A file of poses to take instead of finding them."""
+    """A file of poses to attach instead of estimating them."""
     align: Path | None = None
-    """A file of poses whose world the poses found are to be brought into."""
+    """A file of poses whose world the estimated poses are aligned with."""
     layout: Literal["tum", "euroc", "kitti", "csv", "npz", "colmap"] | None = None
-    """Of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap."""
+    """Layout of that file, if it is not recognised: tum, euroc, kitti, csv, npz or colmap."""
     offset_ms: float = 0.0
-    """Added to the times of that file."""
+    """Time offset in ms that is added to the times of that file."""
     hand_eye: Path | None = None
-    """Where the camera sits on the body the file tracks: a matrix, or x y z qx qy qz qw."""
+    """File of the camera's pose on the tracked body: a matrix, or x y z qx qy qz qw."""
     bounds: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="NEAR FAR")] = None
-    """Nearest and farthest depth, with --trajectory, where the frames do not show them."""
+    """Nearest and farthest depth of the scene in world units, with --trajectory."""
 
     def __post_init__(self) -> None:
         if self.trajectory is not None and self.align is not None:
@@ -45,7 +45,7 @@ class Elsewhere:
             )
 
     def mount(self) -> "Mount":
-        """How the body and the clock of the file relate to the camera's."""
+        """Pose on the tracked body, and time offset, of the camera."""
         from sharpfield.captures.trajectory_files import read_hand_eye
         from sharpfield.preparation.poses.external import Mount
 
@@ -62,12 +62,12 @@ def poses_command(
     options: PoseOptions = FINDING,
     elsewhere: Elsewhere = ELSEWHERE,
 ) -> None:
-    """Find where the camera was from the frames, deblurred with the events, or attach known poses.
+    """Estimate camera poses from frames deblurred with the events, or attach known poses.
 
     Args:
-        capture: Folder of the capture; poses it has are not looked at.
+        capture: Folder of the capture; its own poses are ignored.
         out: Folder of the new capture, with `poses.json` and `poses.html`.
-        options: Images, lens.
+        options: Images, intrinsics, lens.
         elsewhere: Poses from a file.
     """
     from sharpfield.captures.native import layout as native

@@ -1,4 +1,4 @@
-"""Commands about blur: judge the frames of a capture, blur images."""
+"""`sharpfield quality` and `sharpfield blur`: score the sharpness of frames; blur images."""
 
 import json as json_format
 from pathlib import Path
@@ -12,7 +12,7 @@ from sharpfield.simulation.sensors.motion_blur import INTENSITY, PROBABILITY, SI
 
 JUDGING = QualityOptions()
 SHOWN = 12
-"""Frames that are printed."""
+"""Number of frames that are printed."""
 
 
 def quality_command(
@@ -22,13 +22,13 @@ def quality_command(
     layout: str | None = None,
     options: QualityOptions = JUDGING,
 ) -> None:
-    """Say which frames of a video are sharp, whatever they show, and what weight that earns them.
+    """Score the sharpness of frames, independent of their content, and weight them by it.
 
     Args:
         capture: Folder of the capture.
         json: Print JSON with the score and weight of every frame.
         out: Folder for `quality.json`, `ranking.png` and `weights.npy`.
-        layout: Of the capture, if it is not recognised.
+        layout: Layout of the capture, if it is not recognised.
         options: How sharpness is measured.
     """
     from rich.table import Table
@@ -74,11 +74,11 @@ def blur_command(
 
     Args:
         images: Folder of PNG or JPEG images.
-        out: Folder for the blurred ones, of the same names and sizes, and `blur.json`.
-        k: Smallest size of a kernel in px, and the one above the largest.
-        phi: Least and greatest intensity: how crooked a stroke is, 0...1.
-        probability: Share of images that are blurred.
-        seed: Of all kernels.
+        out: Folder for the blurred images, of the same names and sizes, and `blur.json`.
+        k: Range of kernel sizes in px; the upper end is excluded.
+        phi: Range of the intensity 0...1: how crooked the motion is.
+        probability: Fraction of images that are blurred.
+        seed: Random seed of the kernels.
     """
     from sharpfield.preparation.quality import blur_images
     from sharpfield.simulation.sensors.motion_blur import KernelRange

@@ -17,15 +17,15 @@ from sharpfield.training.options import TrainingOptions
 
 @dataclass(frozen=True)
 class Selection:
-    """What of the recipe, and of the capture, is used."""
+    """Presets of the recipe, and the part of the capture to train on."""
 
     preset: str = ""
-    """Named settings, several with commas between them; `sharpfield recipes describe RECIPE` lists
-    them. Left out, they follow the capture and the machine."""
+    """Names of presets with commas between them; `sharpfield recipes describe RECIPE` lists them. By
+    default they follow the capture and the device."""
     use: tuple[str, ...] = ("frames", "events")
-    """Streams of the capture to learn from."""
+    """Streams of the capture to train on."""
     block: str = ""
-    """Part of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
+    """Block of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
     seed: int = 0
     """Random seed."""
     change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
@@ -45,7 +45,7 @@ def train_command(
     reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Train a recipe on a capture.
+    """Train a recipe on a capture. `sharpfield train RECIPE --help` lists the options of a recipe.
 
     Args:
         recipe: Name of the recipe; `sharpfield recipes` lists them.
