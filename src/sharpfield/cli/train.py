@@ -20,7 +20,7 @@ class Selection:
     """Presets of the recipe, and the part of the capture to train on."""
 
     preset: str = ""
-    """Names of presets with commas between them; `sharpfield recipes describe RECIPE` lists them. By
+    """Names of presets, separated by commas; `sharpfield recipes describe RECIPE` lists them. By
     default they follow the capture and the device."""
     use: tuple[str, ...] = ("frames", "events")
     """Streams of the capture to train on."""
