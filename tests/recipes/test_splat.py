@@ -256,7 +256,7 @@ def test_a_distorted_lens_is_learned_through(lens: str) -> None:
 def test_a_lens_that_sees_too_wide_is_refused() -> None:
     fish = Camera(32, 24, 9.0, 9.0, 16.0, 12.0, "fisheye", (0.0, 0.0, 0.0, 0.0))
     model = small("splat").build(replace(recorded(), camera=fish), 0)
-    with pytest.raises(OptionError, match="sees too wide for images of Gaussians"):
+    with pytest.raises(OptionError, match="the field of view is too wide"):
         model.losses(model.draw(0), 0)
 
 
