@@ -51,10 +51,7 @@ STAGES = {
 }
 """Functions whose times are taken, and where they are looked up."""
 
-RUNS = {
-    "hybrid": ("--preset", "standard"),
-    "room-splat": ("--preset", "standard"),
-}
+RUNS = {"hybrid": ("--preset", "standard"), "room-splat": ("--preset", "standard")}
 """Recipes, and what they are asked for."""
 
 WATCHED_S = 0.1

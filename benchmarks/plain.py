@@ -27,13 +27,12 @@ from sharpfield.core.struct import Struct
 from sharpfield.fields.plane_grid import PlaneField
 from sharpfield.formation.adaptive import AdaptiveWeights
 from sharpfield.formation.events import LogContrast
-from sharpfield.formation.rigid_kernel import RigidMotions
+from sharpfield.formation.ray_kernels import RigidMotions
 from sharpfield.geometry.rays import cast
 from sharpfield.geometry.space import Space
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.ev_deblur_nerf import Model
-from sharpfield.recipes.volume.event_term import EventTerm
-from sharpfield.recipes.volume.frame_terms import KernelTerm
+from sharpfield.recipes.volume.terms import EventTerm, KernelTerm
 
 Returned = dict[str, Tensor]
 """What a render call returns, by name; `[rays, ...]`, but for the scalar `roughness`."""

@@ -116,10 +116,7 @@ def _compete(
     source = folders["sharp" if contender.sharp else "stored"]
     run = out / contender.name.replace(", ", "-").replace(" ", "-")
     recipe = prepared(
-        contender.recipe,
-        contender.preset,
-        capture=native.read(source),
-        device=asked.device,
+        contender.recipe, contender.preset, capture=native.read(source), device=asked.device
     )
     started = RunConfig(contender.recipe, recipe, str(source.resolve()), asked.seed)
     options = TrainingOptions(minutes=asked.minutes)

@@ -18,12 +18,11 @@ from torch import Tensor, nn
 import sharpfield as sf
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.nerf import NeRF, draft
-from sharpfield.training.hooks import every
-from sharpfield.training.loop import fit
+from sharpfield.training.loop import every, fit
 from sharpfield.training.optim import adam
 
 

@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1] / "src" / "sharpfield"
 FILES, IN_A_FOLDER, DEPTH = 300, 18, 2
 SMALL = 60
-WORTH_IT: dict[str, str] = {}
+WORTH_IT = {"_shapes.py": "imports numpy, which `_lazy.py` must not"}
 """Small modules with a single importer that are worth a file of their own, and why."""
 
 

@@ -20,10 +20,9 @@ from sharpfield.recipes.settings.options import with_options
 from sharpfield.recipes.settings.presets import prepared
 from sharpfield.recordings.open import open_recording as open_any
 from sharpfield.recordings.recording import ReaderOptions, Recording
-from sharpfield.runs.captures import LayoutName, expect_capture, write
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
-from sharpfield.runs.start import train_run
+from sharpfield.runs.start import LayoutName, expect_capture, train_run, write
 from sharpfield.simulation.by_name import (
     RecordingOptions,
     RigOptions,

@@ -10,9 +10,8 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import PlaneHead, Volume
 from sharpfield.geometry.rays import cast
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
-from sharpfield.recipes.volume.event_term import EventOptions
-from sharpfield.recipes.volume.frame_terms import FrameOptions
 from sharpfield.recipes.volume.scene import VolumeOptions
+from sharpfield.recipes.volume.terms import EventOptions, FrameOptions
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
 
 KERNEL = 1199

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sharpfield.captures.blocks import blocks_of, parse_block, restrict_to_block
+from sharpfield.captures.splits import blocks_of, parse_block, restrict_to_block
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Split
 from sharpfield.core.errors import CaptureError, OptionError

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sharpfield.captures.hold_out import split_by_rule
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.errors import CaptureError, OptionError
 
 

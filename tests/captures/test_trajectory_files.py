@@ -61,11 +61,7 @@ def write_stage(path: Path) -> Path:
 
 @pytest.mark.parametrize(
     ("name", "write", "layout"),
-    [
-        ("a.txt", write_tum, "tum"),
-        ("b.csv", write_euroc, "euroc"),
-        ("c.csv", write_stage, "csv"),
-    ],
+    [("a.txt", write_tum, "tum"), ("b.csv", write_euroc, "euroc"), ("c.csv", write_stage, "csv")],
 )
 def test_all_layouts_say_the_same_poses(tmp_path: Path, name: str, write, layout: str) -> None:
     path = write(tmp_path / name)

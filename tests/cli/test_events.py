@@ -43,10 +43,7 @@ def volume(recorded: Path) -> Path:
 
 @pytest.mark.parametrize("kind", ["splats", "volume"])
 def test_a_stream_that_inspect_reads(
-    kind: str,
-    tmp_path: Path,
-    request: pytest.FixtureRequest,
-    capsys: pytest.CaptureFixture[str],
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "twin.h5"
     assert run("events", request.getfixturevalue(kind), "--out", out, *FAST) == 0

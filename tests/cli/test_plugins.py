@@ -13,7 +13,7 @@ GOOD = '''
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.recipes.settings.presets import Presets
 from sharpfield.recipes.nerf import NeRF
 from sharpfield.recipes.volume.scene import VolumeOptions

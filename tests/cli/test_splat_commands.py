@@ -14,7 +14,7 @@ from sharpfield.fields.gaussians.export import import_splats
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.view import render_view
 from sharpfield.runs.run import open_run
-from sharpfield.storage.splat_file import read_splats
+from sharpfield.storage.ply import read_splats
 from tests.cli.command import run
 
 SMALL = ("--steps", 4, "--change", "gaussians.cap_max=300")

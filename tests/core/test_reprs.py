@@ -9,7 +9,7 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.frames import DepthMaps, Exposure, Frames
 from sharpfield.core.rays import Radiance
 from sharpfield.geometry.trajectory import Still
-from sharpfield.storage.splat_file import SplatTable
+from sharpfield.storage.ply import SplatTable
 
 CAMERA = Camera(6, 4, 5.0, 5.0, 3.0, 2.0)
 NONE = np.zeros(0, np.int16)

@@ -5,12 +5,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.evaluation.alignment_and_depth import (
-    DARK,
-    aligned_psnr,
-    distances,
-    scaled_depth_error,
-)
+from sharpfield.evaluation.scores import DARK, aligned_psnr, distances, scaled_depth_error
 
 CAMERA = Camera(9, 7, 6.0, 6.0, 4.5, 3.5)
 

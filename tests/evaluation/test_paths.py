@@ -130,10 +130,7 @@ def test_without_frames_the_trajectory_is_followed():
         ("orbit", "unknown camera path\n  got    orbit\n  do     use spiral, train, or exposure:N"),
         ("exposure:", "unknown camera path"),
         ("exposure:99", "no such frame\n  got    99\n  do     use a number from 0 to 5"),
-        (
-            "exposure:0",
-            "this frame was taken in one instant, so nothing moves",
-        ),
+        ("exposure:0", "this frame was taken in one instant, so nothing moves"),
     ],
 )
 def test_paths_that_do_not_exist(path, message):

@@ -8,7 +8,7 @@ import pytest
 
 from sharpfield.core.capture import Known, Split
 from sharpfield.core.events import merged
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.evaluation import report
 from sharpfield.evaluation.measure import EvaluationOptions, evaluate
 from sharpfield.evaluation.report import RunDescription, flat, input_name, write_report

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from sharpfield.evaluation.measure import evaluate
-from sharpfield.evaluation.scores import mean, score, view_metrics
-from sharpfield.evaluation.tables import methods_table, views_table
+from sharpfield.evaluation.scores import mean, methods_table, score, view_metrics, views_table
 from sharpfield.metrics.registry import HIGHEST_PSNR
 from tests.evaluation.fake import Sky, capture
 

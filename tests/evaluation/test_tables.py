@@ -1,5 +1,5 @@
-from sharpfield.evaluation.tables import methods_table, reported_metrics, views_table
-from sharpfield.report.tables import markdown
+from sharpfield.evaluation.scores import methods_table, reported_metrics, views_table
+from sharpfield.report.page import markdown
 
 MEAN = {"psnr": 31.239, "ssim": 0.91234, "ssim_paper": 0.9, "lpips": None}
 METRICS = {

@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from sharpfield.core.events import EventStream, SiteColour
-from sharpfield.events.counts import counts_between
+from sharpfield.events.counts import EventMotion, counts_between
 from sharpfield.events.log_path import change_between, pixel_spread, site_spread
-from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 
 WIDTH, HEIGHT = 6, 5

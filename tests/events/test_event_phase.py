@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from sharpfield.core.events import EventStream
-from sharpfield.events.counts import counts_between
+from sharpfield.events.counts import EventMotion, counts_between
 from sharpfield.events.index import build_index
-from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import FALL_US, LONGEST_US, OVERSHOOT, phase_at
 from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
+from sharpfield.events.counts import EventMotion
 from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
-from sharpfield.events.motion import EventMotion
 from sharpfield.simulation.cameras.motions import motion
 from sharpfield.simulation.scenes.static import scene
 from sharpfield.simulation.sensors.event_pixels import EventSensor

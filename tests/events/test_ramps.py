@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sharpfield.core.events import EventStream
+from sharpfield.events.counts import EventMotion
 from sharpfield.events.index import EventIndex, build_index
 from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
-from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import OVERSHOOT, RAMP_US, ramp_at, ramped_log_mean
 from sharpfield.simulation.static_capture import Rig, Timing, simulate
 from sharpfield.storage.event_cache import event_index

@@ -6,7 +6,7 @@ import torch
 from sharpfield.core.protocols import Formation
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import gamma
-from sharpfield.formation.rigid_kernel import ORIGIN, RigidKernel, RigidMotions
+from sharpfield.formation.ray_kernels import ORIGIN, RigidKernel, RigidMotions
 from sharpfield.formation.shutter import Pinhole
 from tests.formation.toy import CAMERA, lit, pixels, swaying, wall
 

@@ -3,8 +3,8 @@ import torch
 from sharpfield.core.protocols import Formation
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import gamma
+from sharpfield.formation.ray_kernels import Bend, SparseKernel, SparsePoints
 from sharpfield.formation.shutter import Pinhole
-from sharpfield.formation.sparse_kernel import Bend, SparseKernel, SparsePoints
 from tests.formation.toy import CAMERA, lit, pixels, swaying, wall
 
 

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from sharpfield.geometry.features import (
-    RATIO,
-    mutual_matches,
-    sift_features,
-    squared_differences,
-)
+from sharpfield.geometry.two_views import RATIO, mutual_matches, sift_features, squared_differences
 
 
 def texture(seed: int = 0) -> np.ndarray:

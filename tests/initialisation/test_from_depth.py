@@ -11,10 +11,10 @@ from sharpfield.core.capture import Capture, Clock, Known, Split
 from sharpfield.core.frames import DepthMaps, Exposure, Frames
 from sharpfield.core.tone import tone_of
 from sharpfield.geometry.trajectory import Still
-from sharpfield.initialisation.from_depth import points_on_surfaces
+from sharpfield.initialisation.static_scene import points_on_surfaces
 from sharpfield.losses.photometric import relative_depth_error
 from sharpfield.recipes.splat import RoomSplat
-from sharpfield.sampling.measured_depth import MeasuredDepth
+from sharpfield.sampling.view_measurements import MeasuredDepth
 
 CAMERA = Camera(24, 16, 20.0, 20.0, 12.0, 8.0)
 AWAY = 2.0
@@ -68,7 +68,7 @@ def test_points_lie_on_the_wall_in_the_colours_of_learned_frames():
 
 
 def test_of_neighbours_the_better_frame_is_taken(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sharpfield.initialisation.from_depth.MAX_FRAMES", 1)
+    monkeypatch.setattr("sharpfield.initialisation.static_scene.MAX_FRAMES", 1)
     start = points_on_surfaces(
         wall(),
         tone_of("gamma2.2"),

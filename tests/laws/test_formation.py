@@ -9,10 +9,9 @@ from sharpfield.core.rays import Rays
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import gamma
 from sharpfield.formation.events import LogContrast
+from sharpfield.formation.ray_kernels import RigidKernel, RigidMotions, SparseKernel, SparsePoints
 from sharpfield.formation.response import FixedResponse, LearnedResponse, LogResidual
-from sharpfield.formation.rigid_kernel import RigidKernel, RigidMotions
 from sharpfield.formation.shutter import Pinhole, Shutter
-from sharpfield.formation.sparse_kernel import SparseKernel, SparsePoints
 from tests.formation.toy import CAMERA, lit, pairs, pixels, still, swaying, wall
 
 

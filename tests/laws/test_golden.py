@@ -5,8 +5,8 @@ import torch
 
 from sharpfield.core.seed import generator
 from sharpfield.formation.events import LogContrast
+from sharpfield.formation.ray_kernels import RigidMotions
 from sharpfield.formation.response import FixedResponse, LearnedResponse
-from sharpfield.formation.rigid_kernel import RigidMotions
 from sharpfield.geometry import se3
 from sharpfield.losses.events import contrast_error
 from tests.formation.toy import CAMERA, lit, pairs, still

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sharpfield.core.measurements import EventPairs
 from sharpfield.events.threshold import FixedThresholds, LearnedThresholds
-from sharpfield.losses.event_counts import count_error, threshold_error
+from sharpfield.losses.events import count_error, threshold_error
 
 SIZE = (2, 3, 5, 4)
 """Looks, windows, height and width."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.metrics.blur_from_events import event_blur
+from sharpfield.metrics.blur_cues import Overlap, depth_overlap, event_blur, flow_overlap
 from sharpfield.metrics.quality import (
     Comparison,
     bending,
@@ -19,7 +19,6 @@ from sharpfield.metrics.quality import (
     reconciled,
     window_weights,
 )
-from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
 from sharpfield.preparation.quality import rank_correlation
 from sharpfield.simulation.room_capture import RoomTiming, simulate_room
 from sharpfield.simulation.static_capture import Rig

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sharpfield.ops.permutation import shuffled
+from sharpfield.core.seed import shuffled
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 15, 16, 17, 255, 1000, 4096, 4097, 100_003])

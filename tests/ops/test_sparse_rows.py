@@ -2,7 +2,7 @@
 
 import torch
 
-from sharpfield.ops.sparse_rows import compact, take_rows
+from sharpfield.ops.dense import compact, take_rows
 
 
 def test_values_and_gradient_are_those_of_indexing():

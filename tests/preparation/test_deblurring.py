@@ -13,7 +13,7 @@ from sharpfield.core.capture import Capture, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure
-from sharpfield.events.motion import EventMotion
+from sharpfield.events.counts import EventMotion
 from sharpfield.preparation.deblurring import deblur_frames, deblur_to
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.preparation.thresholds import find_thresholds

@@ -3,7 +3,7 @@
 import torch
 
 from sharpfield.recipes.d_nerf import DNeRF
-from sharpfield.recipes.volume.warped_scene import WarpedOptions
+from sharpfield.recipes.volume.moving_scenes import WarpedOptions
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving

@@ -15,7 +15,7 @@ from sharpfield.core.protocols import Growing, Model
 from sharpfield.core.rays import Rays, Views
 from sharpfield.evaluation.event_scores import HasLogLight
 from sharpfield.geometry.normalise import recentred
-from sharpfield.initialisation.static_points import backdrop
+from sharpfield.initialisation.static_scene import backdrop
 from sharpfield.initialisation.visual_hull import box_cells, moving_cells
 from sharpfield.recipes.splat import DynamicSplat, EvDynamicSplat
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
@@ -24,7 +24,7 @@ from sharpfield.rendering.splat import whole
 from sharpfield.rendering.view import ViewRenderer, render_view
 from sharpfield.runs.run import open_run
 from sharpfield.storage.event_cache import event_index
-from sharpfield.storage.splat_file import read_splats
+from sharpfield.storage.ply import read_splats
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam

@@ -137,9 +137,7 @@ def test_weights_are_all_the_state_there_is(tiny: Capture) -> None:
 def test_nothing_left_to_learn_from_is_an_error(tiny: Capture) -> None:
     recipe = small(EvDeblurNeRF())
     recipe = replace(
-        recipe,
-        frames=replace(recipe.frames, pixels=0),
-        events=replace(recipe.events, weight=0.0),
+        recipe, frames=replace(recipe.frames, pixels=0), events=replace(recipe.events, weight=0.0)
     )
     with pytest.raises(OptionError, match="nothing is left to learn from"):
         recipe.build(tiny, 0)

@@ -7,7 +7,7 @@ import torch
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recipes.evdnerf import Curriculum, EvDNeRF
-from sharpfield.recipes.volume.warped_scene import WarpedOptions
+from sharpfield.recipes.volume.moving_scenes import WarpedOptions
 from sharpfield.training.optim import adam
 from tests.recipes.moving import tiny_moving
 

@@ -8,9 +8,9 @@ import torch
 
 from sharpfield.fields.voxels import VoxelSizes
 from sharpfield.geometry.normalise import recentred
-from sharpfield.initialisation.visual_hull import silhouettes, visual_hull
+from sharpfield.initialisation.visual_hull import carve_visual_hull, silhouettes
 from sharpfield.recipes.evdnerf_physical import EvDNeRFPhysical, WindowOptions
-from sharpfield.recipes.volume.voxel_scene import MovingOptions
+from sharpfield.recipes.volume.moving_scenes import MovingOptions
 from sharpfield.simulation.cameras.rigs import hand_held, ring
 from sharpfield.simulation.moving_capture import MOVING_RIG, MOVING_TIMING, simulate_moving
 from sharpfield.storage.event_cache import event_index
@@ -92,7 +92,7 @@ def test_voxels_move_only_within_the_hull():
     start = SMALL.build(capture, 0).scene.field
     model = learned(SMALL, capture, 8)
     size = SMALL.scene.size
-    told = visual_hull(
+    told = carve_visual_hull(
         model.capture, event_index(capture.needed_events), cells=size.moving, moments=size.moments
     )
     assert told is not None and told.solid.any()
@@ -116,7 +116,7 @@ def puppet():
 def test_the_hull_holds_what_moves(puppet):
     """By the true depth of what a held-out camera sees."""
     capture, _ = puppet
-    told = visual_hull(capture, event_index(capture.needed_events), cells=24, moments=17)
+    told = carve_visual_hull(capture, event_index(capture.needed_events), cells=24, moments=17)
     assert told is not None and told.possible.float().mean() < 0.3
     frames, camera, covered = capture.needed_frames, capture.camera, []
     toward = camera.direction(camera.grid()).float()
@@ -147,7 +147,9 @@ def test_no_hull_without_cameras_that_stand_still():
         "glider", hand_held(), rig=replace(MOVING_RIG, size=(12, 12)), timing=timing
     )
     capture, _ = recentred(carried)
-    assert visual_hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
+    assert (
+        carve_visual_hull(capture, event_index(capture.needed_events), cells=6, moments=3) is None
+    )
     field = SMALL.build(carried, 0).scene.field
     assert all((rows >= 0).all() for rows in field.rows)
 

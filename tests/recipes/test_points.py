@@ -13,14 +13,13 @@ from torch import nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.protocols import Growing, Model
-from sharpfield.fields.points.networks import PointSizes
+from sharpfield.fields.neural_points import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions, first_cameras, typical_spacing
 from sharpfield.recipes.hybrid import BlurOptions, Hybrid
 from sharpfield.recipes.point_nerf import PointNeRF
-from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.images import SourceOptions, nearest_in_order
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
-from sharpfield.recipes.points.scene import MarchOptions
+from sharpfield.recipes.points.scene import GrowthOptions, MarchOptions
 from sharpfield.rendering.view import render_view
 from sharpfield.training.checkpoint import file_of
 from sharpfield.training.loop import fit

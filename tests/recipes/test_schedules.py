@@ -8,12 +8,7 @@ import torch
 
 from sharpfield.core.capture import Capture
 from sharpfield.formation.response import FixedResponse
-from sharpfield.recipes.ev_deblur_nerf import (
-    EvDeblurNeRF,
-    blender_full,
-    blender_minus,
-    cdavis_full,
-)
+from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, blender_full, blender_minus, cdavis_full
 from sharpfield.recipes.volume.scene import VolumeOptions
 
 TINY = VolumeOptions(

@@ -59,9 +59,7 @@ def photos() -> Capture:
         capture,
         trajectory=Still(poses),
         frames=replace(
-            frames,
-            track=np.arange(len(frames)),
-            exposure=type(frames.exposure)(middle, middle),
+            frames, track=np.arange(len(frames)), exposure=type(frames.exposure)(middle, middle)
         ),
         known=Known(motion="unknown"),
     )
@@ -230,10 +228,7 @@ def test_scattered_rays_are_refused() -> None:
     )
 
 
-LENSES = {
-    "brown": (-0.3, 0.08, 0.002, -0.002, 0.0),
-    "fisheye": (-0.02, 0.005, 0.0, 0.0),
-}
+LENSES = {"brown": (-0.3, 0.08, 0.002, -0.002, 0.0), "fisheye": (-0.02, 0.005, 0.0, 0.0)}
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -5,11 +5,7 @@ import pytest
 
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.plugins import PluginWarning
-from sharpfield.recordings.open import (
-    FORMATS,
-    format_of,
-    open_recording,
-)
+from sharpfield.recordings.open import FORMATS, format_of, open_recording
 from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.storage.event_writer import write_events
 from sharpfield.storage.images import write_image
@@ -23,13 +19,7 @@ from tests.streams import HEIGHT, WIDTH, random_events
         ("prophesee/evt3_sample.raw", "evt", {}, 219_596, 8_801),
         ("prophesee/sample_ncars.dat", "dat", {"size": (304, 240)}, 2_009, 99_952),
         ("inivation/davis346_sample.aedat4", "aedat4", {}, 6_676, 169_941),
-        (
-            "inivation/mnist_0_scale04_0001.aedat",
-            "aedat2",
-            {"size": (128, 128)},
-            15_744,
-            None,
-        ),
+        ("inivation/mnist_0_scale04_0001.aedat", "aedat2", {"size": (128, 128)}, 15_744, None),
         ("ros/test_events_1.bag", "rosbag", {}, 343_474, 2_078_178),
         ("ros/test_events_1", "rosbag", {}, 343_474, 2_078_178),
         ("ros/test_events_2", "rosbag", {}, None, None),
@@ -42,13 +32,7 @@ from tests.streams import HEIGHT, WIDTH, random_events
             29_158,
             13_279,
         ),
-        (
-            "ncaltech_nmnist/faces_easy_0001.bin",
-            "nmnist",
-            {"size": (304, 240)},
-            67_445,
-            None,
-        ),
+        ("ncaltech_nmnist/faces_easy_0001.bin", "nmnist", {"size": (304, 240)}, 67_445, None),
         (
             "blender/atelier/events.h5",
             "hdf5",

@@ -19,15 +19,7 @@ from tests.recordings.tables.test_text import rpg_lines
 from tests.recordings.test_video import video
 from tests.streams import HEIGHT, WIDTH, random_events
 
-REGISTER = (
-    test_aedat2,
-    test_aedat3,
-    test_aedat4,
-    test_dat,
-    test_evt,
-    test_nmnist,
-    test_rosbag,
-)
+REGISTER = (test_aedat2, test_aedat3, test_aedat4, test_dat, test_evt, test_nmnist, test_rosbag)
 """Modules that make sound files known to `fuzz`."""
 
 EVENTS = random_events(300)

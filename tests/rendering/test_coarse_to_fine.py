@@ -11,8 +11,7 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.seed import generator
 from sharpfield.geometry.rays import cast
 from sharpfield.geometry.space import EvenDepth, Frustum
-from sharpfield.rendering.coarse_to_fine import CoarseToFine
-from sharpfield.rendering.head_compositing import Compositing
+from sharpfield.rendering.coarse_to_fine import CoarseToFine, Compositing
 
 CAMERA = Camera(8, 6, 9.0, 9.0, 4.0, 3.0)
 DENSITY, BEGIN, END = 2.0, 1.5, 2.2

@@ -8,12 +8,7 @@ from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import HeadSize, PlaneHead
 from sharpfield.ops.encoding import frequencies
 from sharpfield.rendering import head_compositing as module
-from sharpfield.rendering.head_compositing import (
-    Compositing,
-    RayPoints,
-    RenderedRays,
-    composite_head,
-)
+from sharpfield.rendering.coarse_to_fine import Compositing, RayPoints, RenderedRays, composite_head
 
 RAYS, SAMPLES, LOOKED = 11, 24, 5
 HOWS = {

@@ -12,8 +12,7 @@ from sharpfield.core.tone import tone_of
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry import se3
 from sharpfield.ops.rasterizer import Drawn
-from sharpfield.rendering.splat import Splatting, whole
-from sharpfield.rendering.splat_lens import STEEPEST, flattened, resampled
+from sharpfield.rendering.splat import STEEPEST, Splatting, flattened, resampled, whole
 
 IDEAL = Camera(60, 44, 40.0, 42.0, 31.0, 21.0)
 BARREL = replace(IDEAL, lens="brown", distortion=(-0.3, 0.08, 0.004, -0.003, 0.0))

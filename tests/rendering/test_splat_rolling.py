@@ -10,8 +10,7 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.tone import tone_of
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry import se3
-from sharpfield.rendering.splat import Splatting, whole
-from sharpfield.rendering.splat_rolling import row_shift
+from sharpfield.rendering.splat import Splatting, row_shift, whole
 from tests.rendering.test_splat_lens import BARREL, FISH, IDEAL, dots, draw, middle_of
 
 TURN = torch.tensor([0.03, -0.2, 0.05, 0.1, 0.05, 0.0])

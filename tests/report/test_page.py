@@ -11,11 +11,11 @@ from sharpfield.report.page import (
     CaptionedImage,
     ComparedView,
     ImageEncoding,
+    TextTable,
     _environment,
     data_url,
     render_page,
 )
-from sharpfield.report.tables import TextTable
 
 HOSTILE = "\"'><script>alert(1)</script>&{{ title }}"
 ENCODING = ImageEncoding(40, 80)

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from sharpfield.core.errors import OptionError
-from sharpfield.sampling.patches import PatchShape, draw_patches
-from sharpfield.sampling.pixels_and_pairs import PixelTable
+from sharpfield.sampling.pixels_and_pairs import PatchShape, PixelTable, draw_patches
 
 
 def table(frames: int = 6, height: int = 40, width: int = 60) -> PixelTable:

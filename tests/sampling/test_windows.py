@@ -10,8 +10,8 @@ from sharpfield.sampling.binned import (
     halve_as_released,
     open_windows,
 )
+from sharpfield.sampling.event_windows import Lengths, draw_spans, draw_windows
 from sharpfield.sampling.pixels_and_pairs import pair_table
-from sharpfield.sampling.windows import Lengths, draw_spans, draw_windows
 from sharpfield.storage.event_cache import event_index
 from tests.recipes.moving import tiny_moving
 

@@ -9,7 +9,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Exposure
 from sharpfield.simulation.cameras.motions import exposure_for, instants, travel
-from sharpfield.simulation.cameras.room_walk import walk
+from sharpfield.simulation.cameras.rigs import walk
 from sharpfield.simulation.room_capture import BLURRY_OF_WIDTH, RoomTiming, simulate_room
 from sharpfield.simulation.scenes.building import Paint, build, cylinder
 from sharpfield.simulation.scenes.room_scene import CEILING, FLOOR, ROOM, room

@@ -4,8 +4,8 @@ import pytest
 from sharpfield.core.errors import OptionError
 from sharpfield.recordings.prophesee.evt import open_evt
 from sharpfield.storage.event_cache import read_events
-from sharpfield.storage.event_formats import FORMATS, exporting_events
 from sharpfield.storage.event_layouts import open_events
+from sharpfield.storage.event_writer import FORMATS, exporting_events
 
 
 def read_back(path):

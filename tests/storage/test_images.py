@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.storage.images import (
-    image_stack,
-    list_images,
-    read_image,
-    read_images,
-    write_image,
-)
+from sharpfield.storage.images import image_stack, list_images, read_image, read_images, write_image
 
 
 def made_image(dtype=np.uint8, channels=3, size=(4, 6)):

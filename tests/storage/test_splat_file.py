@@ -7,8 +7,7 @@ import torch
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import numpy_generator
 from sharpfield.ops.encoding import spherical_harmonics
-from sharpfield.storage.ply import Ply, read_ply, write_ply
-from sharpfield.storage.splat_file import SplatTable, read_splats, write_splats
+from sharpfield.storage.ply import Ply, SplatTable, read_ply, read_splats, write_ply, write_splats
 
 
 def made(count: int = 7, *, degree: int = 3) -> SplatTable:

@@ -2,8 +2,7 @@ import pytest
 import torch
 
 from sharpfield.core.errors import RunError
-from sharpfield.training.hooks import describe, every, every_seconds, require_finite
-from sharpfield.training.loop import fit
+from sharpfield.training.loop import describe, every, every_seconds, fit, require_finite
 from sharpfield.training.optim import adam
 from tests.training.toy import Toy
 

@@ -15,9 +15,8 @@ from sharpfield.training.checkpoint import (
     save_last,
 )
 from sharpfield.training.loop import fit
-from sharpfield.training.optim import adam
+from sharpfield.training.optim import adam, apply_growth, resize
 from sharpfield.training.options import TrainingOptions
-from sharpfield.training.point_growth import apply_growth, resize
 from sharpfield.training.session import train
 from tests.training.growing import Blobs, GrowingToy
 from tests.training.toy import Toy, quiet

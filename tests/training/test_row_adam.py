@@ -6,9 +6,8 @@ import torch
 from torch import nn
 
 from sharpfield.core.protocols import Growth
-from sharpfield.ops.sparse_rows import take_rows
-from sharpfield.training.optim import ROW_STEPS, RowAdam
-from sharpfield.training.point_growth import apply_growth
+from sharpfield.ops.dense import take_rows
+from sharpfield.training.optim import ROW_STEPS, RowAdam, apply_growth
 
 
 def slopes(step: int) -> torch.Tensor:

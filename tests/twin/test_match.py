@@ -13,8 +13,8 @@ from sharpfield.core.events import EventStream
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.geometry.trajectory import Still
 from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.twin.agreement import MatchOptions, match_thresholds
 from sharpfield.twin.event_twin import EventTwin, light_of, stated_sensor, track_viewpoint
-from sharpfield.twin.match import MatchOptions, match_thresholds
 from tests.evaluation.fake import Sky
 
 CLOCK = Clock(0, 400_000)

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import FOR_ALL, NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.native.layout import expect_poses
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.capture import Capture, Thresholds
 from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
 from sharpfield.core.plugins import Registry

@@ -36,11 +36,11 @@ class Command:
 GROUPS: dict[str, dict[str, Command]] = {
     "make data": {
         "demo": Command(
-            "demo:demo_command", "record a scene, rebuild it by three methods, compare them"
+            "make_data:demo_command", "record a scene, rebuild it by three methods, compare them"
         ),
-        "simulate": Command("simulate:simulate_command", "record a scene with simulated cameras"),
+        "simulate": Command("make_data:simulate_command", "record a scene with simulated cameras"),
         "footage": Command(
-            "simulate:footage_command",
+            "make_data:footage_command",
             "make blurry frames and events of sharp images",
             renamed={"per_second": "fps"},
         ),
@@ -52,24 +52,24 @@ GROUPS: dict[str, dict[str, Command]] = {
             renamed={"per_second": "fps", "lonely_ms": "isolated_ms"},
         ),
         "inspect": Command(
-            "inspect:inspect_command", "say what a capture, or a file of events, holds"
+            "prepare:inspect_command", "say what a capture, or a file of events, holds"
         ),
         "deblur": Command(
-            "deblur:deblur_command", "sharpen frames with their events, without training"
+            "prepare:deblur_command", "sharpen frames with their events, without training"
         ),
-        "quality": Command("quality:quality_command", "say which frames of a video are sharp"),
-        "blur": Command("quality:blur_command", "blur sharp images by random motion kernels"),
+        "quality": Command("prepare:quality_command", "say which frames of a video are sharp"),
+        "blur": Command("prepare:blur_command", "blur sharp images by random motion kernels"),
         "doctor": Command("doctor:doctor_command", "check a capture before training"),
         "poses": Command(
             "poses:poses_command", "find camera poses, or attach those of other programs"
         ),
         "calibrate": Command(
-            "calibrate:calibrate_command", "measure contrast thresholds, find odd pixels"
+            "prepare:calibrate_command", "measure contrast thresholds, find odd pixels"
         ),
     },
     "learn": {
-        "train": Command("train:train_command", "train a recipe on a capture", recipe=True),
-        "blocks": Command("blocks:blocks_command", "train a long capture in blocks", recipe=True),
+        "train": Command("learn:train_command", "train a recipe on a capture", recipe=True),
+        "blocks": Command("learn:blocks_command", "train a long capture in blocks", recipe=True),
     },
     "look": {
         "evaluate": Command("look:evaluate_command", "measure a run on held-out views"),
@@ -79,14 +79,14 @@ GROUPS: dict[str, dict[str, Command]] = {
             renamed={"images": "frames", "rate": "fps"},
         ),
         "events": Command(
-            "events:events_command", "render the events a camera would report in a scene"
+            "look:events_command", "render the events a camera would report in a scene"
         ),
         "export": Command("look:export_command", "write the Gaussians of a run as a .ply"),
     },
     "tools": {
         "recipes": Command(
             "recipes:recipes_command", "list recipes, describe one, say how to cite it"
-        ),
+        )
     },
 }
 COMMANDS = {name: one for commands in GROUPS.values() for name, one in commands.items()}

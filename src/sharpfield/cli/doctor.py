@@ -37,8 +37,7 @@ def doctor_command(
         json: Print JSON instead of text.
         layout: Layout of the capture, if it is not recognised.
     """
-    from sharpfield.preparation.doctor.checkup import examine_path
-    from sharpfield.preparation.doctor.page import write_doctor_page
+    from sharpfield.preparation.doctor.checkup import examine_path, write_doctor_page
     from sharpfield.storage.images import write_image
 
     checkup, held = examine_path(capture, layout=layout)
@@ -57,7 +56,7 @@ def doctor_command(
 
 def as_json(checkup: "Checkup") -> dict[str, Any]:
     """Plain values."""
-    from sharpfield.preparation.doctor.page import verdict
+    from sharpfield.preparation.doctor.checkup import verdict
 
     return {
         "capture": checkup.name,
@@ -73,14 +72,13 @@ def _text(about: dict[str, Any]) -> str:
 
 
 def _print(checkup: "Checkup") -> None:
-    from sharpfield.preparation.doctor.page import verdict
+    from sharpfield.preparation.doctor.checkup import verdict
 
     console = screen()
     for one in checkup.sorted:
         style = STYLE[one.severity]
         console.print(
-            f"[{style}]{one.severity:<8}[/] {escape(one.check)}: {escape(one.what)}",
-            soft_wrap=True,
+            f"[{style}]{one.severity:<8}[/] {escape(one.check)}: {escape(one.what)}", soft_wrap=True
         )
         for label, text in (("got", one.got), ("do", one.do)):
             if text:

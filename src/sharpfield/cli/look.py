@@ -1,13 +1,17 @@
-"""`sharpfield evaluate`, `render` and `export`: what a trained run looks like."""
+"""`sharpfield evaluate`, `render` and `export`: what a trained run looks like.
+
+`sharpfield events`: the events that an event camera would report in a trained scene.
+"""
 
 from pathlib import Path
 from typing import Literal
 
 from tyro.conf import Positional
 
-from sharpfield.cli.arguments import Device, screen
+from sharpfield.cli.arguments import Device, parse_size, screen
 from sharpfield.core.errors import OptionError
 from sharpfield.evaluation.options import Refinement
+from sharpfield.twin.options import ExtraOptions, PixelOptions, ViewpointOptions
 
 REFINEMENT = Refinement()
 
@@ -46,10 +50,7 @@ def evaluate_command(
     if lpips_backbone is not None and lpips_linear is not None:
         lpips = load_lpips(lpips_backbone, lpips_linear)
     metrics = opened.evaluate(
-        refine=refinement if refine else None,
-        train_views=train_views,
-        lpips=lpips,
-        console=console,
+        refine=refinement if refine else None, train_views=train_views, lpips=lpips, console=console
     )
     mean = {name: value for name, value in metrics["mean"].items() if value is not None}
     console.print("  ".join(f"{name} {value:.4g}" for name, value in mean.items()))
@@ -116,3 +117,50 @@ def export_command(
         return
     count = opened.export(out, encoding=encoding, time=time)
     screen().print(f"{count:,} Gaussians are in {out}")
+
+
+VIEWPOINT, PIXELS, EXTRA = ViewpointOptions(), PixelOptions(), ExtraOptions()
+
+
+def events_command(
+    run: Positional[Path],
+    out: Path,
+    viewpoint: ViewpointOptions = VIEWPOINT,
+    pixels: PixelOptions = PIXELS,
+    extra: ExtraOptions = EXTRA,
+    capture: Path | None = None,
+    device: Device = "auto",
+) -> None:
+    """Render the events that a camera would report in a trained scene.
+
+    Args:
+        run: Folder of the run.
+        out: Event file to write: FILE.h5, FILE.raw, FILE.npz or FILE.csv.
+        viewpoint: Camera, path, time.
+        pixels: Sensor and time steps.
+        extra: Event frames, comparison.
+        capture: Folder of the capture, if it moved.
+        device: Device to render on.
+    """
+    extra.expect_comparable(viewpoint)
+    from sharpfield.runs.events import write_events
+    from sharpfield.runs.run import open_run
+    from sharpfield.storage.event_writer import expect_format
+
+    expect_format(out)
+    opened = open_run(run, capture=capture, device=device)
+    size = _resolution(viewpoint.size, pixels.sensor)
+    write_events(opened, out, viewpoint, pixels, extra, size=size, console=screen())
+
+
+def _resolution(size: str | None, sensor: str) -> tuple[int, int] | None:
+    """The resolution that was asked for: in pixels, or that of a named sensor."""
+    from sharpfield.simulation.sensors.event_pixels import SIZES
+
+    if size != "sensor":
+        return None if size is None else parse_size(size)
+    if sensor not in SIZES:
+        raise OptionError(
+            "this sensor has no size of its own", got=sensor, do=f"name one of {', '.join(SIZES)}"
+        )
+    return SIZES[sensor]

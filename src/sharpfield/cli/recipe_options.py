@@ -147,7 +147,7 @@ def _flag(option: str, taken: set[str]) -> str:
 
 def flag_of(option: str) -> str:
     """The flag of an option in `sharpfield train`, without the dashes in front."""
-    from sharpfield.cli.train import train_command
+    from sharpfield.cli.learn import train_command
 
     return _flag(option, _flags_of(_own_parameters(train_command))).replace("_", "-")
 

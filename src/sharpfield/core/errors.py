@@ -70,8 +70,7 @@ class MissingExtra(SharpfieldError):
 
     def __init__(self, package: str, *, extra: str, purpose: str) -> None:
         super().__init__(
-            f"{purpose} needs the package {package!r}",
-            do=f"pip install 'sharpfield[{extra}]'",
+            f"{purpose} needs the package {package!r}", do=f"pip install 'sharpfield[{extra}]'"
         )
 
 

@@ -177,10 +177,7 @@ PINHOLE = Lens(
     (),
     _pinhole_project,
     _on_plane_one,
-    colmap=(
-        ColmapModel("PINHOLE", 1, TWO_FOCALS),
-        ColmapModel("SIMPLE_PINHOLE", 0, SHARED_FOCAL),
-    ),
+    colmap=(ColmapModel("PINHOLE", 1, TWO_FOCALS), ColmapModel("SIMPLE_PINHOLE", 0, SHARED_FOCAL)),
     nerfstudio="PINHOLE",
     calibration_names=("none", "pinhole", ""),
 )

@@ -3,6 +3,8 @@
 Read this first: a `Trajectory` is the pose of a camera over time, a `Field` the density and colour
 of a scene, a `Renderer` integrates a field along rays, a `Formation` turns sharp light into what a
 sensor reports, and a `Recipe` builds a `Model` from these for one capture.
+
+The publication that a recipe implements, and where the recipe departs from it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,9 +16,21 @@ from jaxtyping import Bool, Float, Int64
 from torch import Generator, Tensor
 
 from sharpfield.core.measurements import Batch, EventPairs
-from sharpfield.core.paper import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
+
+
+@dataclass(frozen=True)
+class Paper:
+    """A publication behind a recipe."""
+
+    key: str
+    """BibTeX key, e.g. `cannici2024evdeblurnerf`."""
+    title: str
+    bibtex: str
+    departures: tuple[str, ...] = ()
+    """Each known departure from the published code, in words, with the reason."""
+
 
 if TYPE_CHECKING:
     from sharpfield.core.capture import Capture

@@ -152,11 +152,7 @@ class HasLogLight(Protocol):
 
 
 def score_events(
-    model: Model,
-    capture: Capture,
-    *,
-    windows: int = WINDOWS,
-    lengths: Sequence[float] = LENGTHS,
+    model: Model, capture: Capture, *, windows: int = WINDOWS, lengths: Sequence[float] = LENGTHS
 ) -> dict[str, Any] | None:
     """Metrics for each window length; None if the capture holds out no event camera.
 

@@ -24,7 +24,7 @@ from sharpfield.evaluation.event_scores import (
 )
 from sharpfield.report.colormaps import Rgb, colour_signs, side_by_side
 from sharpfield.report.event_frames import full_count
-from sharpfield.report.tables import TextTable
+from sharpfield.report.page import TextTable
 from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
 

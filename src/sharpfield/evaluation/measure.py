@@ -22,19 +22,21 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
-from sharpfield.evaluation.alignment_and_depth import (
-    DEPTH_ERROR,
-    PSNR_ALIGNED,
-    aligned_psnr,
-    distances,
-    scaled_depth_error,
-)
 from sharpfield.evaluation.brightness import Brightness
 from sharpfield.evaluation.event_scores import score_events
 from sharpfield.evaluation.event_videos import write_event_videos
 from sharpfield.evaluation.protocol import describe_protocol
 from sharpfield.evaluation.refine import training_pose_errors
-from sharpfield.evaluation.scores import mean, score, view_metrics
+from sharpfield.evaluation.scores import (
+    DEPTH_ERROR,
+    PSNR_ALIGNED,
+    aligned_psnr,
+    distances,
+    mean,
+    scaled_depth_error,
+    score,
+    view_metrics,
+)
 from sharpfield.evaluation.views import (
     RenderedView,
     brightness_of,

@@ -141,9 +141,7 @@ def _spiral(
 
 
 def _circle(
-    poses: Float[np.ndarray, "n 3 4"],
-    target: Float[np.ndarray, "3"],
-    angle: Float[np.ndarray, "m"],
+    poses: Float[np.ndarray, "n 3 4"], target: Float[np.ndarray, "3"], angle: Float[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m 3 4"]:
     """Around the vertical axis through the target, at the cameras' mean height and distance."""
     down = poses[:, :, 1].sum(0)

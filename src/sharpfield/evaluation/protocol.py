@@ -10,8 +10,7 @@ import torch
 
 import sharpfield
 from sharpfield.core.capture import Capture
-from sharpfield.evaluation.alignment_and_depth import DEPTH_ERROR, PSNR_ALIGNED
-from sharpfield.evaluation.scores import view_metrics
+from sharpfield.evaluation.scores import DEPTH_ERROR, PSNR_ALIGNED, view_metrics
 from sharpfield.evaluation.views import Reference
 from sharpfield.metrics.lpips import SMALLEST_PX, Lpips
 from sharpfield.metrics.registry import Metric

@@ -14,23 +14,16 @@ import numpy as np
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.files import replacing
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import luma
 from sharpfield.evaluation.event_videos import events_section
-from sharpfield.evaluation.scores import view_metrics
-from sharpfield.evaluation.tables import methods_table, reported_metrics, views_table
+from sharpfield.evaluation.scores import methods_table, reported_metrics, view_metrics, views_table
 from sharpfield.evaluation.views import SHARP, TRUTH, Reference, held_out, trained_on
 from sharpfield.report.capture import capture_section
 from sharpfield.report.colormaps import ERROR_WHITE, colour_error, eight_bit
 from sharpfield.report.figures import curves_figure
-from sharpfield.report.page import (
-    CaptionedImage,
-    ComparedView,
-    ImageEncoding,
-    Pixels,
-    render_page,
-)
+from sharpfield.report.page import CaptionedImage, ComparedView, ImageEncoding, Pixels, render_page
 from sharpfield.storage.images import read_image
 
 REPORT = "report.html"

@@ -80,12 +80,7 @@ def site_offsets(events: EventStream, site_of: SiteOf, sites: int) -> Int64[np.n
 
 
 def sort_sites(
-    events: EventStream,
-    site_of: SiteOf,
-    offset: Int64[np.ndarray, "o"],
-    *,
-    first: int,
-    last: int,
+    events: EventStream, site_of: SiteOf, offset: Int64[np.ndarray, "o"], *, first: int, last: int
 ) -> tuple[Int64[np.ndarray, "k"], Int8[np.ndarray, "k"]]:
     """Times and polarities of the sites `first` ... `last - 1`, sorted: the second pass.
 

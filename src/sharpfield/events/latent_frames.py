@@ -15,10 +15,9 @@ from torch import Tensor
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.tone import tone_of
-from sharpfield.events.counts import counts_between
+from sharpfield.events.counts import EventMotion, counts_between
 from sharpfield.events.double_integral import FLOOR
 from sharpfield.events.index import EventIndex
-from sharpfield.events.motion import EventMotion
 from sharpfield.events.ramps import ramp_at, ramped_log_mean
 from sharpfield.events.threshold import FixedThresholds
 

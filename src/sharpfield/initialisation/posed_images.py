@@ -12,8 +12,8 @@ from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import tone_of
+from sharpfield.events.counts import EventMotion
 from sharpfield.events.double_integral import latent
-from sharpfield.events.motion import EventMotion
 from sharpfield.events.threshold import FixedThresholds
 from sharpfield.sampling.event_windows import with_events_of
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from sharpfield.core.tone import GAMMA
-from sharpfield.geometry.features import (
+from sharpfield.geometry.two_views import (
     Features,
     mutual_matches,
     sift_features,

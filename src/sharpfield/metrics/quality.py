@@ -25,8 +25,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import Frames
-from sharpfield.metrics.blur_from_events import event_blur
-from sharpfield.metrics.quality_overlap import Overlap, depth_overlap, flow_overlap
+from sharpfield.metrics.blur_cues import Overlap, depth_overlap, event_blur, flow_overlap
 from sharpfield.storage.disk_cache import cached_arrays
 
 WIDTH = 640

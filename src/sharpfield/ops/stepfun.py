@@ -65,9 +65,7 @@ def jitter(depth: Float[Tensor, "*b s"], amount: Float[Tensor, "*b s"]) -> Float
 
 @torch.no_grad()
 def invert(
-    edges: Float[Tensor, "*b e"],
-    weights: Float[Tensor, "*b s"],
-    position: Float[Tensor, "*b m"],
+    edges: Float[Tensor, "*b e"], weights: Float[Tensor, "*b s"], position: Float[Tensor, "*b m"]
 ) -> Float[Tensor, "*b m"]:
     """Inverse of the cumulative weight, with weight uniform within each interval.
 
@@ -89,9 +87,7 @@ def invert(
 
 @torch.no_grad()
 def resample_points(
-    depth: Float[Tensor, "*b s"],
-    weights: Float[Tensor, "*b s"],
-    position: Float[Tensor, "*b m"],
+    depth: Float[Tensor, "*b s"], weights: Float[Tensor, "*b s"], position: Float[Tensor, "*b m"]
 ) -> Float[Tensor, "*b m"]:
     """New points by importance; the bins are between midpoints of the old points.
 

@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import Tone, luma, tone_of
+from sharpfield.events.counts import EventMotion
 from sharpfield.events.double_integral import latent
-from sharpfield.events.motion import EventMotion
-from sharpfield.events.threshold import FixedThresholds
-from sharpfield.events.threshold_search import (
+from sharpfield.events.threshold import (
+    FixedThresholds,
     best_threshold,
     best_thresholds,
     disagreement,

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, Pixels
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import tone_of
@@ -21,9 +21,9 @@ from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.frame_terms import Terms
+from sharpfield.recipes.volume.moving_scenes import WarpedOptions, WarpedScene
 from sharpfield.recipes.volume.scene import stages
-from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.recipes.volume.terms import Terms
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
 
 
@@ -105,11 +105,7 @@ class Model(nn.Module):
         """A random batch of pixels of the training frames."""
         return {
             "frames": draw_pixels(
-                self.pixels,
-                self.recipe.pixels,
-                seed=self.seed,
-                step=step,
-                device=self.scene.device,
+                self.pixels, self.recipe.pixels, seed=self.seed, step=step, device=self.scene.device
             )
         }
 

@@ -16,22 +16,12 @@ from torch import Tensor, nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.core.tone import tone_of
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.event_term import EventOptions, EventTerm
-from sharpfield.recipes.volume.frame_terms import (
-    FrameOptions,
-    InstantsPrior,
-    KernelTerm,
-    MiddlePrior,
-    MotionTerm,
-    PriorOptions,
-    Terms,
-)
 from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, share_of_adaptive
 from sharpfield.recipes.volume.scene import (
     DRAFT,
@@ -40,6 +30,17 @@ from sharpfield.recipes.volume.scene import (
     Volume,
     VolumeOptions,
     stages,
+)
+from sharpfield.recipes.volume.terms import (
+    EventOptions,
+    EventTerm,
+    FrameOptions,
+    InstantsPrior,
+    KernelTerm,
+    MiddlePrior,
+    MotionTerm,
+    PriorOptions,
+    Terms,
 )
 
 NETWORK_RATE = 5e-3
@@ -61,9 +62,7 @@ def blender_full(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
 def blender_minus(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
     """Ev-DeblurNeRF-- of the paper: no EDI prior, gamma instead of a learned response."""
     return replace(
-        blender_full(recipe),
-        events=EventOptions(response="gamma"),
-        prior=PriorOptions(weight=0.0),
+        blender_full(recipe), events=EventOptions(response="gamma"), prior=PriorOptions(weight=0.0)
     )
 
 
@@ -324,11 +323,5 @@ class Model(nn.Module):
             )
         share = share_of_adaptive(recipe.kernel, begin=recipe.frames.blur_from, steps=recipe.steps)
         return KernelTerm(
-            recipe.frames,
-            volume,
-            self.tone.encode,
-            weight,
-            blur=blur,
-            share=share,
-            prior=middle,
+            recipe.frames, volume, self.tone.encode, weight, blur=blur, share=share, prior=middle
         )

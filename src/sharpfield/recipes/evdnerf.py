@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, EventPairs
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
 from sharpfield.core.tone import luma
@@ -25,9 +25,9 @@ from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.frame_terms import Terms
+from sharpfield.recipes.volume.moving_scenes import WarpedOptions, WarpedScene
 from sharpfield.recipes.volume.scene import stages
-from sharpfield.recipes.volume.warped_scene import WarpedOptions, WarpedScene
+from sharpfield.recipes.volume.terms import Terms
 from sharpfield.sampling.binned import BinnedTable, Halved, binned_table, draw_binned, open_windows
 from sharpfield.storage.event_cache import event_index
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, EventPairs, Pixels
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import luma, tone_of
@@ -30,10 +30,10 @@ from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.frame_terms import Terms
-from sharpfield.recipes.volume.voxel_scene import MovingOptions, MovingScene
+from sharpfield.recipes.volume.moving_scenes import MovingOptions, MovingScene
+from sharpfield.recipes.volume.terms import Terms
+from sharpfield.sampling.event_windows import Lengths, draw_spans, draw_windows
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table
-from sharpfield.sampling.windows import Lengths, draw_spans, draw_windows
 from sharpfield.storage.event_cache import event_index
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.formation.patch_kernel import (
     ChosenKernel,
     Edge,

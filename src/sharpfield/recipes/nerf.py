@@ -13,14 +13,14 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Batch, Pixels
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.core.tone import tone_of
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.frame_terms import FrameOptions, KernelTerm, Terms
 from sharpfield.recipes.volume.scene import DRAFT, GRID_RATE, STANDARD, Volume, VolumeOptions
+from sharpfield.recipes.volume.terms import FrameOptions, KernelTerm, Terms
 
 
 def draft(recipe: "NeRF") -> "NeRF":

@@ -8,12 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, TypeVar
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.paper import Paper
-from sharpfield.fields.points.networks import PointSizes
+from sharpfield.core.protocols import Paper
+from sharpfield.fields.neural_points import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions
-from sharpfield.recipes.points.growth import GrowthOptions
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
-from sharpfield.recipes.points.scene import MarchOptions, PointScene
+from sharpfield.recipes.points.scene import GrowthOptions, MarchOptions, PointScene
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 

@@ -12,7 +12,7 @@ from typing import ClassVar, TypeVar
 import numpy as np
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
 from sharpfield.initialisation.posed_images import sharp_light_images
@@ -75,11 +75,7 @@ def refine(recipe: R) -> R:
     if sampling.latent_weight > 0:
         # Latent frames are made with the thresholds as known by now, and would confirm them.
         sampling = replace(
-            sampling,
-            edi_phase=0.3,
-            latent_weight=0.01,
-            event_weight=0.01,
-            max_window_us=200_000,
+            sampling, edi_phase=0.3, latent_weight=0.01, event_weight=0.01, max_window_us=200_000
         )
     return replace(recipe, sampling=sampling, calibration=calibration)
 

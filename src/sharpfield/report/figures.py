@@ -132,11 +132,7 @@ def _score(name: str) -> bool:
 
 
 def _line(
-    axes: Axes,
-    steps: Sequence[float | None],
-    values: Sequence[float | None],
-    name: str,
-    ink: str,
+    axes: Axes, steps: Sequence[float | None], values: Sequence[float | None], name: str, ink: str
 ) -> None:
     """Plot a curve through the steps that have a value."""
     pairs = [(s, v) for s, v in zip(steps, values, strict=True) if s is not None and v is not None]

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from sharpfield.captures.blocks import blocks_of
+from sharpfield.captures.splits import blocks_of
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.splats.model import merge_blocks
 from sharpfield.runs.config import RunConfig, read_run_config, write_run_config

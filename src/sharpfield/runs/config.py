@@ -13,9 +13,9 @@ from typing import Any
 
 import torch
 
-from sharpfield.captures.blocks import blocks_of, parse_block, restrict_to_block
 from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.captures.read import read_capture
+from sharpfield.captures.splits import blocks_of, parse_block, restrict_to_block
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError, RunError
 from sharpfield.core.files import write_json

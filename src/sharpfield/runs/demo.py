@@ -10,11 +10,11 @@ from rich.console import Console
 from sharpfield.captures.native import layout as native
 from sharpfield.core.capture import Capture
 from sharpfield.core.frames import Exposure, Frames
-from sharpfield.evaluation.tables import methods_table
+from sharpfield.evaluation.scores import methods_table
 from sharpfield.preparation.deblurring import deblur_frames
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.recipes.settings.presets import prepared
-from sharpfield.report.tables import markdown
+from sharpfield.report.page import markdown
 from sharpfield.runs.config import RunConfig, device_named
 from sharpfield.runs.run import open_run
 from sharpfield.runs.start import train_run

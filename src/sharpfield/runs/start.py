@@ -1,13 +1,18 @@
-"""Starting a run, or going on with one: a recipe trained on a capture, in a folder."""
+"""Starting a run, or going on with one: a recipe trained on a capture, in a folder.
 
+Captures written to disk in the layouts that other programs read.
+"""
+
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 
-from sharpfield.captures.native.layout import read, write
+from sharpfield.captures.native.layout import read
+from sharpfield.captures.native.layout import write as write_native
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import RunError
+from sharpfield.core.errors import OptionError, RunError, did_you_mean
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
 from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
@@ -45,7 +50,7 @@ def train_run(
     if config.capture == OWN_CAPTURE:
         given, own = capture, folder / OWN_CAPTURE
         if not options.resume or not own.exists():
-            write(given, own)
+            write_native(given, own)
         capture = read(own)  # what will be read when the run is opened again
         if repr(capture) != repr(given):  # counts, sizes and spans of frames and events
             raise RunError(
@@ -74,3 +79,56 @@ def train_run(
         console=console,
     )
     return Run(folder, config, built[-1], part)
+
+
+if TYPE_CHECKING:  # names of layouts are read without importing torch
+    from sharpfield.core.capture import Capture
+
+LayoutName = Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"]
+WRITERS: dict[str, str] = {
+    "native": "native.layout",
+    "ev-deblur-nerf": "writers.llff_events",
+    "evdnerf": "writers.evdnerf",
+    "scannet": "writers.scannet",
+}
+"""Modules in `sharpfield.captures`, each with a function `write`."""
+
+
+def write(capture: "Capture", folder: Path | str, layout: str = "native") -> None:
+    """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
+
+    Args:
+        capture: To be written.
+        folder: Where.
+        layout: native, which keeps everything; ev-deblur-nerf, evdnerf, scannet.
+
+    Raises:
+        OptionError: There is no such layout.
+        CaptureError: The folder holds something else, or the capture holds something the layout
+            has no place for.
+    """
+    expect_capture(capture)
+    if layout not in WRITERS:
+        raise OptionError("unknown layout to write", got=layout, do=did_you_mean(layout, WRITERS))
+    import_module(f"sharpfield.captures.{WRITERS[layout]}").write(capture, Path(folder))
+
+
+def expect_capture(capture: object) -> None:
+    """Make sure that this is a capture, and that its events are valid; it may be made by hand.
+
+    Raises:
+        OptionError: It is something else.
+        ShapeError: A column of its events has another type.
+        CaptureError: Its events are not valid.
+    """
+    from sharpfield.core.capture import Capture
+    from sharpfield.core.events import checked
+
+    if not isinstance(capture, Capture):
+        raise OptionError(
+            "this is not a capture",
+            got=type(capture).__name__,
+            do="give what sf.read or sf.simulate return; sf.train also takes a folder",
+        )
+    if capture.events is not None:
+        checked(capture.events, capture.name)

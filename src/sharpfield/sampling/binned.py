@@ -53,12 +53,7 @@ class BinnedTable:
 
 
 def binned_table(
-    index: EventIndex,
-    clock: Clock,
-    windows: int,
-    size: tuple[int, int],
-    *,
-    halved: Halved = "no",
+    index: EventIndex, clock: Clock, windows: int, size: tuple[int, int], *, halved: Halved = "no"
 ) -> BinnedTable:
     """Event frames of all cameras that reported anything.
 

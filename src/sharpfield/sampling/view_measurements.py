@@ -1,20 +1,49 @@
 """What was measured of whole views: frames, latent frames, event windows and depth, as tensors.
 
 Leading axes: m cameras, then k instants (or k - 1 windows); then the rows and columns of the crop.
+
+Depth maps of a depth camera, resampled to the pixels of the frames.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 from torch import Tensor
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
+from sharpfield.core.frames import LEAST_DEPTH, DepthMaps
 from sharpfield.core.measurements import Depths, EventPairs, Instants, Pixels
 from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
 from sharpfield.sampling.event_windows import CameraEvents, Times, counts_in_windows
-from sharpfield.sampling.measured_depth import MeasuredDepth
+
+
+class MeasuredDepth:
+    """Depth for the pixels of frames.
+
+    Args:
+        maps: Of the depth camera.
+        camera: Of the frames.
+    """
+
+    def __init__(self, maps: DepthMaps, camera: Camera) -> None:
+        self.maps = maps
+        ray = camera.direction(camera.grid().double())
+        xy = maps.camera.project(ray / ray[..., 2:]).numpy()
+        x, y = np.floor(xy[..., 0]).astype(np.int64), np.floor(xy[..., 1]).astype(np.int64)
+        self.inside: Bool[np.ndarray, "h w"] = (
+            (x >= 0) & (x < maps.camera.width) & (y >= 0) & (y < maps.camera.height)
+        )
+        self.column: Int64[np.ndarray, "h w"] = np.where(self.inside, x, 0)
+        self.row: Int64[np.ndarray, "h w"] = np.where(self.inside, y, 0)
+
+    def at(self, frame: int) -> Float32[np.ndarray, "h w"]:
+        """Depth along the axis at every pixel of a frame; 0 where unknown."""
+        seen = self.maps.at(frame)[self.row, self.column]
+        return np.where(self.inside & (seen > LEAST_DEPTH), seen, 0).astype(np.float32)
+
 
 Tracks = Int64[np.ndarray, "m"]
 FrameRows = Int64[np.ndarray, "m"]

@@ -16,9 +16,8 @@ from jaxtyping import Float64, Int64
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.measurements import Batch
-from sharpfield.core.seed import number, numpy_generator
+from sharpfield.core.seed import number, numpy_generator, shuffled
 from sharpfield.events.latent_frames import LatentFrames, SensorEstimate
-from sharpfield.ops.permutation import shuffled
 from sharpfield.sampling.event_windows import Times, camera_events
 from sharpfield.sampling.view_measurements import Crop, Tracks, ViewMeasurements
 

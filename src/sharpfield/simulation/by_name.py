@@ -42,7 +42,7 @@ class RoomOptions:
     def sensors(self) -> "RoomSensors":
         """Accuracy of depth and poses."""
         from sharpfield.simulation.room_capture import RoomSensors
-        from sharpfield.simulation.sensors.depth import DepthSensor
+        from sharpfield.simulation.sensors.frames import DepthSensor
 
         return RoomSensors(DepthSensor(self.depth_noise), self.drift)
 

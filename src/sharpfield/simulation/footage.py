@@ -115,9 +115,7 @@ def video_footage(
     video.release()
     if not count or not (per_second or shown > 0):
         raise CaptureError(
-            "not a video that can be decoded",
-            where=file,
-            got=f"{count} images, {shown} per second",
+            "not a video that can be decoded", where=file, got=f"{count} images, {shown} per second"
         )
 
     def images() -> Iterator[Float32[np.ndarray, "h w 3"]]:

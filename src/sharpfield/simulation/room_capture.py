@@ -27,12 +27,11 @@ from sharpfield.simulation.cameras.motions import (
     stamped,
     travel,
 )
-from sharpfield.simulation.cameras.room_walk import walk
+from sharpfield.simulation.cameras.rigs import walk
 from sharpfield.simulation.scenes.room_scene import room
 from sharpfield.simulation.scenes.static import Scene
-from sharpfield.simulation.sensors.depth import DepthSensor, drifting
 from sharpfield.simulation.sensors.events import EventPixels, Gap, joined
-from sharpfield.simulation.sensors.frames import Exposing, store
+from sharpfield.simulation.sensors.frames import DepthSensor, Exposing, drifting, store
 from sharpfield.simulation.sensors.motion_blur import PUBLISHED, KernelRange, blurred, drawn_blur
 from sharpfield.simulation.static_capture import MARGIN_US, Rig, drawn_ahead, view
 

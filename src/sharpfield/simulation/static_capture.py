@@ -224,11 +224,7 @@ def record(
 ) -> Recorder:
     """Record with both cameras of a rig; seed: of pixel differences and noise."""
     recorder = Recorder(
-        rig.size,
-        exposure,
-        frame_sensor=rig.frame_sensor,
-        event_sensor=rig.event_sensor,
-        seed=seed,
+        rig.size, exposure, frame_sensor=rig.frame_sensor, event_sensor=rig.event_sensor, seed=seed
     )
     for t_us, rgb in images(place, path, rig.camera(), timing):
         recorder.see(rgb, t_us)

@@ -12,21 +12,33 @@ window in about 3 ms; without `hdf5plugin` it is gzip 1 with shuffle, which ever
 
 A long recording is written in parts, which remain when writing is interrupted. `join_events` joins
 them without decompressing: HDF5 chunks are copied as they are.
+
+Writing events in the format given by the suffix of a file name, chunk by chunk.
+
+    .h5     our own, see `storage.event_writer`: it states its units and sensor resolution
+    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
+    .csv    a header `t_us,x,y,p`, then one event per line; p is -1 or +1
+    .raw    Prophesee's EVT3, see `storage.evt_writer`
+
+In every format the file appears whole, at the end, or not at all, and one chunk is in memory.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
 import numpy as np
 from jaxtyping import UInt64
 
-from sharpfield.core.errors import CaptureError
+from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, checked
 from sharpfield.core.files import replacing
+from sharpfield.storage.arrays import Column, write_arrays
 from sharpfield.storage.event_file import CHUNK
+from sharpfield.storage.evt_writer import writing_evt
 from sharpfield.storage.hdf5 import compression_plugin
 
 FORMAT, VERSION = "sharpfield-events", 1
@@ -132,11 +144,7 @@ class EventWriter:
 
 @contextmanager
 def writing_events(
-    path: Path | str,
-    like: EventStream,
-    *,
-    span_us: int | None = None,
-    origin_us: int | None = None,
+    path: Path | str, like: EventStream, *, span_us: int | None = None, origin_us: int | None = None
 ) -> Iterator[EventWriter]:
     """A writer for `path`; the file appears when the block ends well, whole, or not at all.
 
@@ -217,13 +225,7 @@ def _join_column(joined: h5py.File, name: str, columns: Sequence[h5py.Dataset]) 
     total = sum(len(column) for column in columns)
     space = h5py.h5s.create_simple((total,), (h5py.h5s.UNLIMITED,))
     settings = first.id.get_create_plist()  # chunks and filters as in the parts
-    made = h5py.h5d.create(
-        joined["events"].id,
-        name.encode(),
-        first.id.get_type(),
-        space,
-        settings,
-    )
+    made = h5py.h5d.create(joined["events"].id, name.encode(), first.id.get_type(), space, settings)
     base = 0
     for column in columns:
         for i in range(column.id.get_num_chunks()):
@@ -241,3 +243,78 @@ def _joined_ms_to_idx(files: Sequence[Any], counts: Sequence[int]) -> UInt64[np.
         known.append(file[MS_TO_IDX][first_ms:] + np.uint64(base))
         base += count
     return np.concatenate(known)
+
+
+Append = Callable[[EventStream], None]
+"""Appends events that are later than all earlier ones."""
+
+
+@contextmanager
+def exporting_events(path: Path, like: EventStream) -> Iterator[Append]:
+    """A function that appends events to a new file.
+
+    Args:
+        path: Ends in .h5, .npz, .csv or .raw.
+        like: Any stream of the same sensor; it may be empty.
+
+    Raises:
+        OptionError: The name has another suffix.
+    """
+    expect_format(path)
+    with FORMATS[path.suffix](path, like) as append:
+        yield append
+
+
+def expect_format(path: Path) -> None:
+    """Check that the suffix of a file name is a format of events.
+
+    Raises:
+        OptionError: It is not.
+    """
+    if path.suffix not in FORMATS:
+        raise OptionError(
+            "unknown format of events", got=path, do=f"name a file with {', '.join(FORMATS)}"
+        )
+
+
+@contextmanager
+def _native(path: Path, like: EventStream) -> Iterator[Append]:
+    with writing_events(path, like) as writer:
+        yield writer.append
+
+
+@contextmanager
+def _arrays(path: Path, like: EventStream) -> Iterator[Append]:
+    about = {"tick_ns": 1000, "width": like.width, "height": like.height}
+    with replacing(path) as temporary, TemporaryDirectory(dir=path.parent, prefix=".") as folder:
+        columns = {name: Column(Path(folder) / name) for name in ("x", "y", "t", "p")}
+
+        def append(events: EventStream) -> None:
+            for name, column in columns.items():
+                column.append(getattr(events, "t_us" if name == "t" else name))
+
+        append(like[:0])
+        yield append
+        numbers = {name: np.array(value) for name, value in about.items()}
+        write_arrays(temporary, columns | numbers)
+
+
+@contextmanager
+def _text(path: Path, like: EventStream) -> Iterator[Append]:
+    with replacing(path) as temporary, temporary.open("w") as file:
+        file.write("t_us,x,y,p\n")
+
+        def append(events: EventStream) -> None:
+            rows = np.stack([events.t_us, events.x, events.y, events.p], -1)
+            np.savetxt(file, rows, "%d", delimiter=",")
+
+        yield append
+
+
+@contextmanager
+def _raw(path: Path, like: EventStream) -> Iterator[Append]:
+    with writing_evt(path, like) as writer:
+        yield writer.append
+
+
+FORMATS = {".h5": _native, ".npz": _arrays, ".csv": _text, ".raw": _raw}

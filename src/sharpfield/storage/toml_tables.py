@@ -67,9 +67,7 @@ class Table:
         unknown = sorted(set(self.values) - set(known))
         if unknown:
             raise CaptureError(
-                f"unknown key `{unknown[0]}`",
-                where=self.where,
-                do=f"known are {', '.join(known)}",
+                f"unknown key `{unknown[0]}`", where=self.where, do=f"known are {', '.join(known)}"
             )
 
     def _value(self, key: str, kind: type, fallback: Any) -> Any:

@@ -29,8 +29,7 @@ from torch.optim import Optimizer
 from sharpfield.core.errors import RunError
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model, PointSet
-from sharpfield.training.optim import module_of
-from sharpfield.training.point_growth import replace_parameters, resize
+from sharpfield.training.optim import module_of, replace_parameters, resize
 
 Settings = dict[str, Any]
 """What a run was started with, as JSON."""

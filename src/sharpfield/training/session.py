@@ -22,9 +22,8 @@ from sharpfield.training.checkpoint import (
     recover,
     restore,
 )
-from sharpfield.training.hooks import every, every_seconds, require_finite
 from sharpfield.training.log import LogLosses, TrainingLog
-from sharpfield.training.loop import Hook, fit
+from sharpfield.training.loop import Hook, every, every_seconds, fit, require_finite
 from sharpfield.training.optim import adam
 from sharpfield.training.options import TrainingOptions
 from sharpfield.training.plan import Build, Plan, make_plan

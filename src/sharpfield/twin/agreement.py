@@ -7,21 +7,49 @@
 
 The PSNR of event frames has a fixed peak in counts. The published one has a peak of twice the
 largest count of the whole set, which gives predicting no events at all a high score.
+
+Thresholds at which the rendered camera reports as many events as were recorded.
+
+A trained scene lacks fine texture and sharp edges, so its light changes less and a camera in front
+of it reports too few events. Lower thresholds restore the number of events. They cannot correct
+where and when events happen; the factors on the thresholds measure how soft the scene is.
+
+    window    a time window of the recording in which events are counted
+    lead      the time before a window, simulated but not counted, in which each pixel comes to the
+              reference level of its own last event
+    factor    on the threshold of each polarity; the same for any sensor
+
+Source: our own. EDI (Pan et al., CVPR 2019) and Robust e-NeRF (Low and Lee, ICCV 2023) also take
+thresholds from data, as part of the reconstruction.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 
+from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.metrics.image import relative_count_error
 from sharpfield.report.colormaps import colour_signs, side_by_side
 from sharpfield.report.event_frames import count_events, full_count, signed
+from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.simulation.sensors.events import EventPixels
+from sharpfield.twin.event_twin import (
+    TIME_STEPS,
+    TimeSteps,
+    Viewpoint,
+    images,
+    light_of,
+    stated_sensor,
+    track_viewpoint,
+)
 
 MOST_COUNT = 20
 """Counts of a pixel and window are clipped to this before they are compared as images."""
@@ -148,3 +176,187 @@ def _keys(events: EventStream, start_us: int, span: int) -> Int64[np.ndarray, "n
         for position, size in ((events.x, events.width), (events.y, events.height))
     )
     return ((y * events.width + x) * 2 + (events.p > 0)) * span + (events.t_us - start_us)
+
+
+ROUNDS = 12
+"""Most iterations of the search."""
+TOLERANCE = 0.005
+"""The search ends when the counts of both polarities are within this share."""
+EXPONENT = 0.7
+"""A threshold is multiplied by this power of the ratio of counts: counts grow faster than
+thresholds fall, since weaker edges begin to cross them."""
+LARGEST_FACTOR = 4.0
+"""Largest factor on a threshold, and the inverse of the smallest."""
+
+TimedImages = list[tuple[int, Float32[np.ndarray, "h w"]]]
+"""Times in us and light images of a lead and its window."""
+
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """Which part of the recording is compared."""
+
+    windows: int = 6
+    """Number of windows, spread evenly over the recording and over its cameras."""
+    window_us: int = 24_000
+    """Length of a window."""
+    lead_us: int = 24_000
+    """Time simulated before each window without counting its events."""
+
+    def __post_init__(self) -> None:
+        if self.windows < 1 or self.window_us < 1 or self.lead_us < 0:
+            raise OptionError(
+                "matching needs at least one window of a positive length",
+                got=f"{self.windows} of {self.window_us} us, after {self.lead_us} us",
+            )
+
+
+MATCH_OPTIONS = MatchOptions()
+
+
+@dataclass(frozen=True)
+class ThresholdFactors:
+    """Factors on the thresholds of both polarities."""
+
+    on: float
+    """Factor on the threshold of events to brighter."""
+    off: float
+    """Factor on the threshold of events to darker."""
+    recorded: int
+    """Recorded events in all windows."""
+    unmatched: int
+    """Rendered events in the same windows, at the thresholds that the capture states."""
+
+    def applied(self, sensor: EventSensor) -> EventSensor:
+        """A sensor with its thresholds multiplied by the factors."""
+        return replace(
+            sensor,
+            threshold_on=sensor.threshold_on * self.on,
+            threshold_off=sensor.threshold_off * self.off,
+        )
+
+
+def match_thresholds(
+    model: Any,
+    capture: Capture,
+    *,
+    options: MatchOptions = MATCH_OPTIONS,
+    away_from: tuple[int, int] | None = None,
+    subpixels: int = 1,
+    time_steps: TimeSteps = TIME_STEPS,
+) -> ThresholdFactors:
+    """Find thresholds for which a model gives as many events as its training capture recorded.
+
+    Args:
+        model: Trained.
+        capture: What it was trained on, as read.
+        options: Which part of the recording is compared.
+        away_from: A time span in us that no window overlaps: the one to be predicted.
+        subpixels: See `light_of`.
+        time_steps: Time steps of the simulated sensor.
+
+    Raises:
+        OptionError: There are no events to match, or the scene gives far too few or too many.
+    """
+    sensor = stated_sensor(capture)
+    stream = capture.events
+    if stream is None or not len(stream):
+        raise OptionError("the capture has no events to match thresholds to", where=capture.name)
+    rendered: list[tuple[int, TimedImages]] = []
+    recorded = np.zeros(2, np.int64)
+    for view, start_us in _windows(model, capture, stream, options, away_from):
+        light = light_of(model, view, subpixels=subpixels)
+        rendered.append((start_us, list(images(light, view.span_us, sensor, time_steps))))
+        recorded += _by_polarity(stream.of_track(view.track).window(start_us, view.span_us[1]).p)
+    if not recorded.all():
+        raise OptionError(
+            "too little was recorded to match thresholds to",
+            where=capture.name,
+            got=f"{recorded[0]} events to darker, {recorded[1]} to brighter, in all windows",
+        )
+    factor, unmatched = _fit(rendered, sensor, recorded)
+    return ThresholdFactors(float(factor[1]), float(factor[0]), int(recorded.sum()), unmatched)
+
+
+def _windows(
+    model: Any,
+    capture: Capture,
+    stream: EventStream,
+    options: MatchOptions,
+    away_from: tuple[int, int] | None,
+) -> Iterator[tuple[Viewpoint, int]]:
+    """The viewpoint during each lead and window, and when the window begins."""
+    length_us = options.lead_us + options.window_us
+    tracks = np.unique(stream.track).tolist() if stream.track is not None else [0]
+    found = 0
+    for number, track in zip(range(options.windows), itertools.cycle(tracks), strict=False):
+        view = track_viewpoint(model, capture, int(track))
+        share = (number + 0.5) / options.windows
+        begin = _start_us(view.span_us, length_us, away_from, share)
+        if begin is None:
+            continue
+        found += 1
+        end = min(begin + length_us, view.span_us[1])
+        yield replace(view, span_us=(begin, end)), min(begin + options.lead_us, end - 1)
+    if not found:
+        raise OptionError(
+            "nothing of the recording is left to match thresholds to",
+            where=capture.name,
+            do="predict a shorter time span",
+        )
+
+
+def _start_us(
+    span_us: tuple[int, int], length_us: int, away_from: tuple[int, int] | None, share: float
+) -> int | None:
+    """Start of a window at a share 0...1 of all possible starts; None if there are none."""
+    first, last = span_us
+    if away_from is None:
+        return first + round(share * max(last - first - length_us, 0))
+    before = min(away_from[0], last) - length_us + 1 - first
+    after = last - length_us + 1 - max(away_from[1], first)
+    position = int(share * (max(before, 0) + max(after, 0)))
+    if before > 0 and position < before:
+        return first + position
+    return max(away_from[1], first) + position - max(before, 0) if after > 0 else None
+
+
+def _fit(
+    rendered: list[tuple[int, TimedImages]], sensor: EventSensor, recorded: Int64[np.ndarray, "2"]
+) -> tuple[Float64[np.ndarray, "2"], int]:
+    """Factors on the thresholds (darker, brighter), and the number of events without them."""
+    factor, unmatched = np.ones(2), 0
+    for number in range(ROUNDS):
+        scaled = replace(
+            sensor,
+            threshold_on=sensor.threshold_on * factor[1],
+            threshold_off=sensor.threshold_off * factor[0],
+        )
+        counts = sum(
+            (_count(timed, start_us, scaled) for start_us, timed in rendered), np.zeros(2, np.int64)
+        )
+        unmatched = unmatched if number else int(counts.sum())
+        ratio = np.maximum(counts, 1) / recorded
+        if np.abs(ratio - 1).max() < TOLERANCE:
+            break
+        factor = factor * ratio**EXPONENT
+        if not (1 / LARGEST_FACTOR < factor.min() and factor.max() < LARGEST_FACTOR):
+            raise OptionError(
+                "the number of rendered events is too far from the recorded one to be matched",
+                got=f"{unmatched:,} events where {recorded.sum():,} were recorded",
+                do="train it longer, or check the threshold that the capture states",
+            )
+    return factor, unmatched
+
+
+def _count(timed: TimedImages, start_us: int, sensor: EventSensor) -> Int64[np.ndarray, "2"]:
+    """Number of events to darker and to brighter since the start of a window."""
+    pixels, counts = EventPixels(sensor, 0), np.zeros(2, np.int64)
+    for t_us, light in timed:
+        gap = pixels.see(light, 1000 * t_us)
+        counts += _by_polarity(gap.p[gap.t_us >= start_us])
+    return counts
+
+
+def _by_polarity(p: np.ndarray) -> Int64[np.ndarray, "2"]:
+    return np.array([np.count_nonzero(p < 0), np.count_nonzero(p > 0)], np.int64)

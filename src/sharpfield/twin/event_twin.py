@@ -218,11 +218,7 @@ def path_viewpoint(
 
 
 def light_of(
-    model: Any,
-    viewpoint: Viewpoint,
-    *,
-    subpixels: int = 1,
-    progress: Progress | None = None,
+    model: Any, viewpoint: Viewpoint, *, subpixels: int = 1, progress: Progress | None = None
 ) -> LightAt:
     """A function that renders the light of a model at a viewpoint.
 

@@ -18,7 +18,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.progress import progress_on
 from sharpfield.recordings.open import open_recording
 from sharpfield.report.event_frames import count_events, writing_frames
-from sharpfield.storage.event_formats import exporting_events
+from sharpfield.storage.event_writer import exporting_events
 from sharpfield.storage.images import write_image
 from sharpfield.twin.agreement import busiest_window, compare_events
 from sharpfield.twin.event_twin import Viewpoint

@@ -53,11 +53,7 @@ def test_a_pinhole_scene(tmp_path):
     [
         ({"k1": 0.1, "k2": 0.2, "p1": 0.3, "p2": 0.4}, "brown", (0.1, 0.2, 0.3, 0.4, 0.0)),
         ({"camera_model": "OPENCV", "k3": 0.5}, "brown", (0, 0, 0, 0, 0.5)),
-        (
-            {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4},
-            "fisheye",
-            (0.1, 0, 0, 0.4),
-        ),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "fisheye", (0.1, 0, 0, 0.4)),
         ({"camera_model": "PINHOLE", "k1": 0.1}, "pinhole", ()),
     ],
 )

@@ -98,9 +98,7 @@ def variations(panning: Capture) -> dict[str, Capture]:
             ),
         ),
         "still": replace(
-            panning,
-            frames=replace(frames, track=np.arange(9)),
-            trajectory=Still(still(9)),
+            panning, frames=replace(frames, track=np.arange(9)), trajectory=Still(still(9))
         ),
         "spline": replace(panning, trajectory=spline),
         "tracks": replace(

@@ -3,9 +3,14 @@ import torch
 
 from sharpfield.core.protocols import PointSet
 from sharpfield.core.seed import generator
-from sharpfield.fields.gaussians.densify import PRUNE_OPACITY, GradientStats, densify, reset_opacity
+from sharpfield.fields.gaussians.densify import (
+    PRUNE_OPACITY,
+    GradientStats,
+    densify_and_prune,
+    reset_opacity,
+)
 from sharpfield.fields.gaussians.static import Gaussians
-from sharpfield.training.point_growth import apply_growth
+from sharpfield.training.optim import apply_growth
 
 SMALL, LARGE, HUGE = 0.005, 0.05, 0.5
 """Scales in a scene of extent 1."""
@@ -25,7 +30,9 @@ def scene(scales: list[float], opacities: list[float] | None = None) -> Gaussian
 
 
 def densified(made: Gaussians, mean_grad: list[float], *, cap_max: int = 99):
-    return densify(made, torch.tensor(mean_grad), 1.0, cap_max=cap_max, generator=chance())
+    return densify_and_prune(
+        made, torch.tensor(mean_grad), 1.0, cap_max=cap_max, generator=chance()
+    )
 
 
 def test_small_ones_are_cloned():
@@ -73,7 +80,7 @@ def test_those_of_the_largest_gradient_come_first_up_to_the_maximum():
 
 def test_content_gaussians_stay_as_they_are():
     assert densified(scene([SMALL, LARGE]), [1e-4, 1e-4]) is None
-    assert densify(scene([]), torch.zeros(0), 1.0, cap_max=9, generator=chance()) is None
+    assert densify_and_prune(scene([]), torch.zeros(0), 1.0, cap_max=9, generator=chance()) is None
 
 
 def test_gradients_are_averaged_over_the_views_that_saw_a_splat():

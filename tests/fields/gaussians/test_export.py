@@ -6,7 +6,7 @@ from sharpfield.fields.gaussians.export import export_splats, import_splats, tra
 from sharpfield.fields.gaussians.static import FLAT, GREY, Gaussians
 from sharpfield.geometry.se3 import rotation_exp
 from sharpfield.geometry.space import Similarity
-from sharpfield.storage.splat_file import read_splats
+from sharpfield.storage.ply import read_splats
 from tests.fields.gaussians.test_static import made
 
 EYE = torch.tensor([[0.3, -0.2, -4.0]])

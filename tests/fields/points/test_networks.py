@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sharpfield.fields.points.cloud import NeuralPoints
-from sharpfield.fields.points.networks import (
+from sharpfield.fields.neural_points import (
     ColourHead,
+    NeuralPoints,
     PointField,
     PointSizes,
     interleaved,

@@ -9,8 +9,12 @@ import pytest
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.preparation.calibrate.measure import ThresholdCalibration, calibrate
-from sharpfield.preparation.calibrate.report import calibration_text, write_calibration
+from sharpfield.preparation.calibrate.measure import (
+    ThresholdCalibration,
+    calibrate,
+    calibration_text,
+    write_calibration,
+)
 from sharpfield.preparation.options import CalibrateOptions
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
 from sharpfield.simulation.static_capture import Rig, Timing, simulate

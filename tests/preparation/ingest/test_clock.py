@@ -179,11 +179,7 @@ def both(a: Triggers, b: Triggers) -> Triggers:
 
 def test_pulses_are_exposures():
     found = exposures_from_triggers(pulses(3), 3, channel=None, where="cam.raw")
-    assert [found.window(i) for i in range(3)] == [
-        (500, 4_500),
-        (10_500, 14_500),
-        (20_500, 24_500),
-    ]
+    assert [found.window(i) for i in range(3)] == [(500, 4_500), (10_500, 14_500), (20_500, 24_500)]
 
 
 def test_an_edge_before_the_first_pulse_is_no_exposure():

@@ -30,7 +30,7 @@ from sharpfield.recordings.recording import Frame, ReaderOptions, Recording, Tri
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.simulation.static_capture import Rig, simulate
 from sharpfield.simulation.static_capture import Timing as Exposures
-from sharpfield.storage.event_formats import exporting_events
+from sharpfield.storage.event_writer import exporting_events
 from sharpfield.storage.images import write_image
 from tests.recordings.aedat.aedat4_writer import write_aedat4
 from tests.recordings.ros.ros1_writer import write_ros1_bag

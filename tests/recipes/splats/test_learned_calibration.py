@@ -161,8 +161,7 @@ def test_knots_go_back_to_where_the_camera_was(tiny: Capture):
         with torch.no_grad():
             made.path.twist += moved
         batch = blurred(
-            truth,
-            made.sampler.exposure_batch(1, made.calibration.sensor_estimate(), events=False),
+            truth, made.sampler.exposure_batch(1, made.calibration.sensor_estimate(), events=False)
         )
         slope = torch.autograd.grad(made.losses(batch, 0)["blur"], made.path.twist)[0]
         assert slope.sum((0, 1))[axis] > 0, "going down the slope undoes the move"

@@ -41,8 +41,7 @@ def container(path: Path, streams: str, packets: list[tuple[int, bytes]], table:
     """An AEDAT4 file without compression."""
     xml = XML.format(streams=streams).encode()
     header = packed(
-        "IOHE",
-        [Scalar(0, "i", 0), Scalar(1, "q", table), Vector(2, xml + b"\0", len(xml))],
+        "IOHE", [Scalar(0, "i", 0), Scalar(1, "q", table), Vector(2, xml + b"\0", len(xml))]
     )
     body = b"".join(struct.pack("<ii", number, len(data)) + data for number, data in packets)
     path.write_bytes(b"#!AER-DAT4.0\r\n" + header + body)
@@ -325,8 +324,7 @@ def written(packing) -> Callable[[], bytes]:
 # A byte of LZ4 stands for up to 255 bytes, which is 16 events; one of Zstandard for any number.
 for packing, most in (("none", 1.0), ("lz4", 16.0), ("zstd", 1e4)):
     fuzz.register(
-        f"aedat4-{packing}",
-        fuzz.Case(written(packing), open_aedat4, ".aedat4", most_per_byte=most),
+        f"aedat4-{packing}", fuzz.Case(written(packing), open_aedat4, ".aedat4", most_per_byte=most)
     )
 
 

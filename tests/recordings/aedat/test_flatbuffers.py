@@ -29,11 +29,7 @@ def test_what_is_written_is_read() -> None:
     ]
     data = packed("ABCD", parts)
     table = root(data, "ABCD")
-    assert (table.number(0, "b"), table.number(1, "q"), table.number(4, "h")) == (
-        -3,
-        -(2**60),
-        300,
-    )
+    assert (table.number(0, "b"), table.number(1, "q"), table.number(4, "h")) == (-3, -(2**60), 300)
     assert table.number(2, "i", -1) == -1
     assert bytes(table.vector(3, 1)) == b"text"
     assert bytes(table.vector(6, 8)) == bytes(range(16))

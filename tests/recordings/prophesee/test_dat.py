@@ -39,8 +39,7 @@ def random_records(count: int) -> bytes:
 
 
 fuzz.register(
-    "dat",
-    fuzz.Case(lambda: HEADER.encode() + b"\x0c\x08" + random_records(500), open_dat, ".dat"),
+    "dat", fuzz.Case(lambda: HEADER.encode() + b"\x0c\x08" + random_records(500), open_dat, ".dat")
 )
 
 

@@ -148,11 +148,7 @@ fuzz.register("evt3", fuzz.Case(lambda: evt3_header() + random_evt3(1500), open_
 
 @pytest.mark.parametrize(
     ("encoding", "data"),
-    [
-        ("evt2", random_evt2(400)),
-        ("evt2.1", random_evt21(200)),
-        ("evt3", random_evt3(2000)),
-    ],
+    [("evt2", random_evt2(400)), ("evt2.1", random_evt21(200)), ("evt3", random_evt3(2000))],
 )
 @pytest.mark.parametrize("block", [1, 7, 64])
 def test_blocks_may_be_cut_anywhere(encoding: str, data: bytes, block: int) -> None:
@@ -196,10 +192,7 @@ def test_evt2_words() -> None:
     data = evt2(
         high2(t), cd2(639, 479, t, 1), cd2(0, 0, t, 0), edge, 0xE0000001, 0xF1234567, high2(t + 1)
     ) + evt2(cd2(5, 6, t + 1, 1))
-    assert decode("evt2", data) == (
-        [(639, 479, t, 1), (0, 0, t, -1), (5, 6, t + 1, 1)],
-        "",
-    )
+    assert decode("evt2", data) == ([(639, 479, t, 1), (0, 0, t, -1), (5, 6, t + 1, 1)], "")
     found = decode_triggers("evt2", [data], where="test")
     assert (found.t_us.tolist(), found.edge.tolist(), found.channel.tolist()) == ([327], [1], [3])
 

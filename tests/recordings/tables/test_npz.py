@@ -9,7 +9,7 @@ from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables import npz
 from sharpfield.recordings.tables.npz import open_npy, open_npz, open_npz_folder
-from sharpfield.storage.event_formats import exporting_events
+from sharpfield.storage.event_writer import exporting_events
 from tests.recordings import fuzz
 from tests.streams import HEIGHT, WIDTH, random_events
 

@@ -11,7 +11,7 @@ from sharpfield.recordings.open import format_of
 from sharpfield.recordings.recording import ReaderOptions
 from sharpfield.recordings.tables import text
 from sharpfield.recordings.tables.text import open_text
-from sharpfield.storage.event_formats import exporting_events
+from sharpfield.storage.event_writer import exporting_events
 from tests.recordings import fuzz
 from tests.streams import random_events
 

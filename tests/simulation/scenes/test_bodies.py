@@ -1,8 +1,16 @@
 import numpy as np
 import pytest
 
-from sharpfield.simulation.scenes.bodies import Bodies, after, placed
-from sharpfield.simulation.scenes.building import Paint, ball, box, build, rectangle
+from sharpfield.simulation.scenes.building import (
+    Bodies,
+    Paint,
+    after,
+    ball,
+    box,
+    build,
+    placed,
+    rectangle,
+)
 from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.scenes.textures import CHECKS, TILES
 

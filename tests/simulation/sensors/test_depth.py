@@ -5,9 +5,9 @@ import pytest
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.cameras.room_walk import walk
+from sharpfield.simulation.cameras.rigs import walk
 from sharpfield.simulation.room_capture import ROOM_SENSORS, RoomSensors, RoomTiming, simulate_room
-from sharpfield.simulation.sensors.depth import DepthSensor, drifting
+from sharpfield.simulation.sensors.frames import DepthSensor, drifting
 from sharpfield.simulation.static_capture import Rig
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 80.0, 60.0)

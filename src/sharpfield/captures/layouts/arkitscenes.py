@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Shaped
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
     PUBLISHED_SPLIT,
@@ -33,6 +32,7 @@ from sharpfield.captures.layouts._rgbd import (
     rgbd_capture,
 )
 from sharpfield.captures.native.frames import decode_depth
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError

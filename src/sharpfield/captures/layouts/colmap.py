@@ -23,7 +23,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
@@ -34,6 +33,7 @@ from sharpfield.captures.layouts._photos import (
     photo_capture,
     same_camera,
 )
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
@@ -364,9 +364,5 @@ def _with_any_suffix(path: Path) -> Path:
 
 
 LAYOUT = Layout(
-    "colmap",
-    recognise,
-    read,
-    "sparse/0/cameras.bin and images*/",
-    options=("factor", "missing"),
+    "colmap", recognise, read, "sparse/0/cameras.bin and images*/", options=("factor", "missing")
 )

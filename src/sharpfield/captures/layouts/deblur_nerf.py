@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import HOLD_OUT, Photos, choose_images, photo_capture
 from sharpfield.captures.layouts.colmap import find_model, read_model
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError

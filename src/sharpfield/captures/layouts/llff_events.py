@@ -26,10 +26,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Int64, Shaped
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import choose_images
 from sharpfield.captures.layouts.deblur_nerf import PosesBounds, read_poses_bounds
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import POSE_TOLERANCE_US, Capture, Clock, Known, Note, Thresholds
 from sharpfield.core.errors import CaptureError
@@ -209,9 +209,7 @@ def _events(
         file = opened if opened.unit else replace(opened, unit=variant.event_unit)
         if len(file):
             file.expect_overlap(
-                known_us,
-                known="poses",
-                do="give the unit of the events, ns or us (`event_unit`)",
+                known_us, known="poses", do="give the unit of the events, ns or us (`event_unit`)"
             )
         events = read_events(file, between=known_us)
         if len(file) > len(events):

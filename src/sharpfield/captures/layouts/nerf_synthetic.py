@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import HOLD_OUT, Photos, photo_capture
 from sharpfield.captures.layouts._transforms import BLENDER_BOUNDS, images_of, train_and_held_out
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.capture import Capture, Known, Split
 
 

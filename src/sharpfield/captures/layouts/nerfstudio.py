@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._photos import (
     HOLD_OUT,
@@ -35,6 +34,7 @@ from sharpfield.captures.layouts._transforms import (
     poses_of,
     read_json,
 )
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError

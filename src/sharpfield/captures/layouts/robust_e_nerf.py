@@ -198,8 +198,5 @@ def _views(folder: Path, camera: Camera, clock: Clock) -> _Views:
 
 
 LAYOUT = Layout(
-    "robust-e-nerf",
-    recognise,
-    read,
-    "raw_events.npz, camera_poses.npz and camera_calibration.npz",
+    "robust-e-nerf", recognise, read, "raw_events.npz, camera_poses.npz and camera_calibration.npz"
 )

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
     PUBLISHED_SPLIT,
@@ -33,6 +32,7 @@ from sharpfield.captures.layouts._rgbd import (
     usable_poses,
 )
 from sharpfield.captures.native.frames import decode_depth
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.storage.images import SUFFIXES, image_stack, read_image

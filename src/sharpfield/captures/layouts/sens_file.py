@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8, UInt16
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import PUBLISHED_SPLIT, RgbdFrames, pinhole, rgbd_capture
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt16
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
     PUBLISHED_SPLIT,
@@ -27,6 +26,7 @@ from sharpfield.captures.layouts._rgbd import (
     usable_poses,
 )
 from sharpfield.captures.native.frames import decode_depth
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError

@@ -234,11 +234,7 @@ def _read_events(about: Table, path: Path, camera: Camera, clock: Clock) -> Even
 
 
 def _expect_tracks(
-    trajectory: Trajectory,
-    frames: Frames | None,
-    streams: list[EventStream | None],
-    *,
-    where: Path,
+    trajectory: Trajectory, frames: Frames | None, streams: list[EventStream | None], *, where: Path
 ) -> None:
     """Check that the tracks of frames and events have poses."""
     known = count_tracks(trajectory)

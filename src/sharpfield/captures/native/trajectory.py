@@ -93,11 +93,7 @@ def _packed(trajectory: object) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             return {"kind": "still"}, {"poses": trajectory.poses}
         case BSpline():
             return (
-                {
-                    "kind": "bspline",
-                    "start_us": trajectory.start_us,
-                    "end_us": trajectory.end_us,
-                },
+                {"kind": "bspline", "start_us": trajectory.start_us, "end_us": trajectory.end_us},
                 {
                     "knots": trajectory.get_buffer("knots").numpy(),
                     "twist": trajectory.twist.detach().numpy(),

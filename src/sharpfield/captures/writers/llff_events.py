@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64, Shaped
 
-from sharpfield.captures.hold_out import split_by_rule
 from sharpfield.captures.layouts.llff_events import BLENDER, COLOR_DAVIS, RGGB, Variant, recognise
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError

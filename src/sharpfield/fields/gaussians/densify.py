@@ -92,7 +92,7 @@ class DensifyOptions:
     """Largest scale, as a fraction of the extent, above which it is pruned."""
 
 
-def densify(
+def densify_and_prune(
     gaussians: Gaussians,
     mean_grad: Float[Tensor, "n"],
     extent: float,

@@ -18,7 +18,7 @@ from sharpfield.fields.gaussians.static import FLAT, GREY, Gaussians
 from sharpfield.geometry.se3 import quaternion_from_rotation, rotation_from_quaternion
 from sharpfield.geometry.space import Similarity
 from sharpfield.ops.encoding import spherical_harmonics
-from sharpfield.storage.splat_file import SplatTable, read_splats, write_splats
+from sharpfield.storage.ply import SplatTable, read_splats, write_splats
 
 DIRECTIONS = 64
 """In which spherical harmonics are evaluated to rotate them; 16 would do."""

@@ -226,14 +226,7 @@ where_below = _where("<")
 """The row, but zero where `tested` reaches a limit."""
 
 
-EXPONENTIAL = (
-    1.0,
-    0.6931469776,
-    0.2402224207,
-    0.05550733766,
-    0.009671513139,
-    0.001326472021,
-)
+EXPONENTIAL = (1.0, 0.6931469776, 0.2402224207, 0.05550733766, 0.009671513139, 0.001326472021)
 """2^x for -1/2 <= x <= 1/2 as a polynomial, lowest power first; off by 2e-7 of the value."""
 
 

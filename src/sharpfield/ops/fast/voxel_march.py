@@ -15,24 +15,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sharpfield.ops.fast._kernel import kernel, memory, share, spread
-from sharpfield.ops.fast._ray_samples import (
+from sharpfield.ops.fast._voxels import (
     MIN_TRANSMITTANCE,
     PARTS,
     add_parts,
-    composite,
-    record,
-    record_opaque_end,
-    sample_buffers,
-    sample_gradient,
-)
-from sharpfield.ops.fast._voxels import (
     add_to_moving,
     add_to_static,
+    composite,
     inside,
     lookup_buffers,
     point_on,
     read_moving,
     read_static,
+    record,
+    record_opaque_end,
+    sample_buffers,
+    sample_gradient,
     time_gradient,
     zero,
 )

@@ -205,10 +205,7 @@ def _error(
 
 
 def _lines(
-    images: np.ndarray,
-    matches: PairMatches,
-    camera: Camera,
-    poses: Float64[np.ndarray, "n 3 4"],
+    images: np.ndarray, matches: PairMatches, camera: Camera, poses: Float64[np.ndarray, "n 3 4"]
 ) -> np.ndarray:
     """Two images side by side, their matches coloured by epipolar distance."""
     both = [np.broadcast_to(images[i], (*images[i].shape[:2], 3)) for i in matches.pair]

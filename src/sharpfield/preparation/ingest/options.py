@@ -124,9 +124,7 @@ class IngestSummary:
     """What is unknown yet: poses, intrinsics, depth bounds."""
 
 
-def assign_roles(
-    recordings: tuple[Recording, ...],
-) -> tuple[Recording | None, Recording | None]:
+def assign_roles(recordings: tuple[Recording, ...]) -> tuple[Recording | None, Recording | None]:
     """The recording that gives the events, and the one that gives the frames.
 
     Raises:

@@ -88,8 +88,7 @@ class StagingFolder:
         """Save the result of the first pass."""
         with replacing(self.folder / "survey.npz") as temporary:
             write_arrays(
-                temporary,
-                {name: np.asarray(value) for name, value in vars(survey).items()},
+                temporary, {name: np.asarray(value) for name, value in vars(survey).items()}
             )
 
     def load_survey(self) -> Survey | None:

@@ -21,11 +21,11 @@ from sharpfield.geometry.two_views import depths_of, find_features, match_pairs,
 from sharpfield.preparation.poses.images import sfm_images
 from sharpfield.preparation.poses.path import (
     FramesOnPath,
+    KnownPoses,
     capture_on_path,
     frames_on_tracks,
     path_through,
 )
-from sharpfield.preparation.poses.world import KnownPoses
 
 PAIRS = 12
 BOUNDS_PERCENT, BOUNDS_MARGIN = (1.0, 99.0), 1.2

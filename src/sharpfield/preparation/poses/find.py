@@ -27,14 +27,16 @@ from sharpfield.preparation.poses.mapping import (
     SfmMap,
     map_images,
 )
-from sharpfield.preparation.poses.path import FramesOnPath, capture_on_path, path_through
-from sharpfield.preparation.poses.world import (
+from sharpfield.preparation.poses.path import (
+    FramesOnPath,
     KnownPoses,
     PoseErrors,
+    capture_on_path,
     centred_world,
     depths,
     known_world,
     measured_world,
+    path_through,
 )
 
 INSTANTS, MAX_IMAGES = 3, 120

@@ -68,10 +68,7 @@ def sfm_images(capture: Capture, source: ImageSource, *, instants: int = 1) -> S
         )
     plain = np.flatnonzero(~blurred) if source == "edi" else np.arange(len(frames))
     made = SfmImages(
-        source,
-        stored_as_bytes(frames.images[plain]),
-        plain,
-        frames.exposure.middle_us[plain],
+        source, stored_as_bytes(frames.images[plain]), plain, frames.exposure.middle_us[plain]
     )
     if source == "edi":
         made = _joined(made, _deblurred(capture, instants))
@@ -79,10 +76,7 @@ def sfm_images(capture: Capture, source: ImageSource, *, instants: int = 1) -> S
     if source == "sharpest":
         order = _sharpest(made, frames.track, order)
     return replace(
-        made,
-        images=made.images[order],
-        frame=made.frame[order],
-        time_us=made.time_us[order],
+        made, images=made.images[order], frame=made.frame[order], time_us=made.time_us[order]
     )
 
 

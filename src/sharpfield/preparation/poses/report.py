@@ -14,8 +14,13 @@ from sharpfield.core.seed import evenly_spread
 from sharpfield.preparation.poses.find import PosesFound
 from sharpfield.preparation.poses.find_checks import advice
 from sharpfield.report.figures import trajectory_figure
-from sharpfield.report.page import CaptionedImage, ComparedView, ImageEncoding, write_page
-from sharpfield.report.tables import TextTable
+from sharpfield.report.page import (
+    CaptionedImage,
+    ComparedView,
+    ImageEncoding,
+    TextTable,
+    write_page,
+)
 
 
 def poses_summary(original: Capture, found: PosesFound) -> dict[str, Any]:

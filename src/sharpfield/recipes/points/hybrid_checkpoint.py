@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from sharpfield.core.errors import RunError
-from sharpfield.fields.points.cloud import NeuralPoints
-from sharpfield.fields.points.networks import ColourHead, PointField
+from sharpfield.fields.neural_points import ColourHead, NeuralPoints, PointField
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
 from sharpfield.recipes.points.images import ImageBranch
 

@@ -22,16 +22,14 @@ from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
-from sharpfield.fields.points.networks import ColourHead
+from sharpfield.fields.neural_points import ColourHead
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
 from sharpfield.formation.shutter import Pinhole
 from sharpfield.losses.regularizers import indecision
-from sharpfield.recipes.points.growth import grown, missing_points
 from sharpfield.recipes.points.images import ImageBranch, Prepared
-from sharpfield.recipes.points.scene import PointScene
+from sharpfield.recipes.points.scene import PointScene, grown, missing_points
 from sharpfield.rendering.points import PointRadiance, ShadedSamples
-from sharpfield.sampling.patches import PatchShape, draw_patches
-from sharpfield.sampling.pixels_and_pairs import pixel_table
+from sharpfield.sampling.pixels_and_pairs import PatchShape, draw_patches, pixel_table
 
 if TYPE_CHECKING:  # which imports this module
     from sharpfield.recipes.point_nerf import PointNeRF

@@ -5,7 +5,7 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
-from sharpfield.core.paper import Paper
+from sharpfield.core.protocols import Paper
 
 
 def paper_of(recipe: str) -> Paper:

@@ -52,8 +52,7 @@ class Presets:
         for name in names:
             if name not in self.all:
                 raise OptionError(
-                    f"the recipe {recipe} has no preset {name!r}",
-                    do=did_you_mean(name, self.all),
+                    f"the recipe {recipe} has no preset {name!r}", do=did_you_mean(name, self.all)
                 )
         return names
 

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sharpfield.captures.blocks import Block
+from sharpfield.captures.splits import Block
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -29,9 +29,9 @@ from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.formation.exposure import EventWindow, ExposureOfViews
 from sharpfield.geometry.normalise import normalised, recentred
 from sharpfield.geometry.rolling import Rolling
-from sharpfield.initialisation.moving import moving_gaussians
-from sharpfield.initialisation.static_points import backdrop_points, static_points
-from sharpfield.losses.event_counts import count_error, threshold_error
+from sharpfield.initialisation.static_scene import backdrop_points, static_points
+from sharpfield.initialisation.visual_hull import moving_gaussians
+from sharpfield.losses.events import count_error, threshold_error
 from sharpfield.losses.photometric import l1, relative_depth_error
 from sharpfield.metrics.quality import frame_weights
 from sharpfield.recipes.splats.learned_calibration import (

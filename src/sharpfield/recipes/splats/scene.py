@@ -21,7 +21,7 @@ from sharpfield.core.tone import Tone
 from sharpfield.fields.gaussians.dynamic import GaussianUnion, MovingGaussians
 from sharpfield.fields.gaussians.static import Gaussians
 from sharpfield.geometry.rolling import Rolling
-from sharpfield.initialisation.static_points import background_colour
+from sharpfield.initialisation.static_scene import background_colour
 from sharpfield.recipes.splats.strategy import DensifyStrategy, GrowthPlan, McmcStrategy, Strategy
 from sharpfield.rendering.splat import Cloud, Splatting
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
-from sharpfield.fields.gaussians.densify import GradientStats, densify, reset_opacity
+from sharpfield.fields.gaussians.densify import GradientStats, densify_and_prune, reset_opacity
 from sharpfield.fields.gaussians.mcmc import opacity_scale_penalty, position_noise, relocate_and_add
 from sharpfield.fields.gaussians.static import Gaussians
 
@@ -108,7 +108,7 @@ class DensifyStrategy(nn.Module):
         if (step + 1) % (RESET_ROUNDS * self.plan.every) == 0:
             return [(gaussians, reset_opacity(gaussians.opacity_logits))]
         made = generator(self.plan.seed, step, self.plan.name, gaussians.means.device)
-        growth = densify(
+        growth = densify_and_prune(
             gaussians, self.stats.mean_grad, EXTENT, cap_max=self.plan.cap_max, generator=made
         )
         if growth is None:

@@ -13,7 +13,7 @@ from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Curve
 from sharpfield.formation.adaptive import AdaptiveWeights, Integration, Norm
-from sharpfield.formation.rigid_kernel import RigidKernel, RigidMotions
+from sharpfield.formation.ray_kernels import RigidKernel, RigidMotions
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.volume.scene import stages
 

@@ -20,8 +20,7 @@ from sharpfield.geometry.normalise import normalised, reference_poses
 from sharpfield.geometry.space import EvenDepth, Frustum, Space, forward_facing
 from sharpfield.losses.regularizers import smoothness
 from sharpfield.ops.grid import total_variation
-from sharpfield.rendering.coarse_to_fine import CoarseToFine
-from sharpfield.rendering.head_compositing import Compositing
+from sharpfield.rendering.coarse_to_fine import CoarseToFine, Compositing
 from sharpfield.rendering.voxels import EvenSteps
 
 MOST_CELLS = 4_000_000

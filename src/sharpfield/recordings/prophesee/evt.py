@@ -121,12 +121,7 @@ def open_evt(path: Path | str, options: ReaderOptions = NO_OPTIONS) -> Recording
 
 
 def decode_chunks(
-    encoding: str,
-    data: Iterable[bytes],
-    size: tuple[int, int],
-    *,
-    where: object,
-    log: ReadLog,
+    encoding: str, data: Iterable[bytes], size: tuple[int, int], *, where: object, log: ReadLog
 ) -> Chunks:
     """Decode the events of a byte stream, which may be cut into blocks anywhere.
 

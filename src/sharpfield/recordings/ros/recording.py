@@ -52,11 +52,7 @@ from sharpfield.recordings.ros.event_messages import (
 )
 from sharpfield.recordings.ros.ros2 import MCAP_MAGIC, SQLITE_MAGIC, open_mcap, open_sqlite_bag
 
-OPENERS = {
-    ROS1_LINE: open_ros1_bag,
-    MCAP_MAGIC: open_mcap,
-    SQLITE_MAGIC: open_sqlite_bag,
-}
+OPENERS = {ROS1_LINE: open_ros1_bag, MCAP_MAGIC: open_mcap, SQLITE_MAGIC: open_sqlite_bag}
 """Functions to open a bag by its signature; the suffix does not decide, as unfinished bags have
 another."""
 

@@ -63,13 +63,7 @@ def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
             yield from _chunks(opened, log.start("events"), integral=integral)
 
     return Recording(
-        path,
-        layout,
-        size=size,
-        events=events,
-        bayer=bayer,
-        thresholds=thresholds,
-        log=log,
+        path, layout, size=size, events=events, bayer=bayer, thresholds=thresholds, log=log
     )
 
 
@@ -121,10 +115,7 @@ def _inside(
 
 
 def _expect_order(
-    t_us: Int64[np.ndarray, "n"],
-    numbers: Int64[np.ndarray, "n"],
-    before: int | None,
-    path: Path,
+    t_us: Int64[np.ndarray, "n"], numbers: Int64[np.ndarray, "n"], before: int | None, path: Path
 ) -> None:
     back = np.flatnonzero(np.diff(t_us) < 0)
     if before is not None and len(t_us) and t_us[0] < before:

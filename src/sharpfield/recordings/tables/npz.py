@@ -69,9 +69,7 @@ def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         CaptureError: The file has no events in a known layout, or its unit or size is unknown.
     """
     return column_recording(
-        npz_dialect(path),
-        path,
-        lambda: open_events(path, unit=options.unit, size=options.size),
+        npz_dialect(path), path, lambda: open_events(path, unit=options.unit, size=options.size)
     )
 
 

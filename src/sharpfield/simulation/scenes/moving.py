@@ -11,8 +11,17 @@ from collections.abc import Callable
 import numpy as np
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.scenes.bodies import Bodies, Map, Part, after, placed
-from sharpfield.simulation.scenes.building import Paint, ball, box, build
+from sharpfield.simulation.scenes.building import (
+    Bodies,
+    Map,
+    Paint,
+    Part,
+    after,
+    ball,
+    box,
+    build,
+    placed,
+)
 from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.scenes.textures import (
     BRICKS,
@@ -156,10 +165,7 @@ def _jelly() -> Moving:
     parts += [(k + 1, box(middle, (0.62, 0.62, LAYER), paint)) for k in range(LAYERS)]
     parts += [
         (LAYERS + 1, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=5))),
-        (
-            LAYERS + 2,
-            ball((0, 0, 0), 0.2, Paint("#f4d06f", "#24476b", "#ffffff", LEAVES, 5)),
-        ),
+        (LAYERS + 2, ball((0, 0, 0), 0.2, Paint("#f4d06f", "#24476b", "#ffffff", LEAVES, 5))),
     ]
 
     def maps(t: float) -> list[Map]:

@@ -12,8 +12,16 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.scenes.bodies import Bodies
-from sharpfield.simulation.scenes.building import FLAT, Paint, Surface, ball, box, build, rectangle
+from sharpfield.simulation.scenes.building import (
+    FLAT,
+    Bodies,
+    Paint,
+    Surface,
+    ball,
+    box,
+    build,
+    rectangle,
+)
 from sharpfield.simulation.scenes.surfaces import Surfaces, trace
 from sharpfield.simulation.scenes.textures import (
     BRICKS,

@@ -1,4 +1,7 @@
-"""`sharpfield simulate` and `sharpfield footage`: captures made by simulated sensors."""
+"""`sharpfield simulate` and `sharpfield footage`: captures made by simulated sensors.
+
+`sharpfield demo`: record a scene, rebuild it by three methods, and compare them.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,8 +9,8 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from sharpfield.cli.arguments import Size, parse_size, screen
-from sharpfield.runs.captures import LayoutName
+from sharpfield.cli.arguments import Device, Size, parse_size, screen
+from sharpfield.runs.start import LayoutName
 from sharpfield.simulation.by_name import (
     RECORDING,
     RIG,
@@ -42,7 +45,7 @@ def simulate_command(
         rig: Cameras around a moving scene.
         timing: Frames, exposures and sampling.
     """
-    from sharpfield.runs.captures import write
+    from sharpfield.runs.start import write
     from sharpfield.simulation.by_name import simulate_named
 
     made = simulate_named(
@@ -91,3 +94,26 @@ def _say_made(made: Any, out: Path) -> None:
     frames = 0 if made.frames is None else len(made.frames)
     events = sum(len(one) for one in (made.events, made.test_events) if one is not None)
     screen().print(f"{frames} frames and {events:,} events are in {out}")
+
+
+def demo_command(
+    out: Path = Path("runs/demo"),
+    size: Size = "240x160",
+    scene: str = "garden",
+    minutes: float = 1.0,
+    seed: int = 0,
+    device: Device = "auto",
+) -> None:
+    """Record a scene with a shaky camera, rebuild it sharply, and compare with two baselines.
+
+    Args:
+        out: Folder of the run; its report.html shows everything.
+        size: Sensor resolution of the simulated camera, WIDTHxHEIGHT.
+        scene: Name of a closed-form scene: garden, shelf, tiles or mobile.
+        minutes: Training time of each of the three methods.
+        seed: Random seed of the recording and of training.
+        device: Device to train on.
+    """
+    from sharpfield.runs.demo import run_demo
+
+    run_demo(out, parse_size(size), scene, minutes, seed, device=device)

@@ -1,20 +1,85 @@
-"""`sharpfield blocks`: train a long capture in blocks, in one process or under torchrun."""
+"""`sharpfield train`: train a recipe on a capture.
+
+`sharpfield blocks`: train a long capture in blocks, in one process or under torchrun.
+"""
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
+import tyro
 from tyro.conf import Positional
 
 from sharpfield.captures.layout import NO_OPTIONS, ReadOptions
 from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
-from sharpfield.cli.train import TRAINING, Selection
 from sharpfield.core.errors import OptionError
 from sharpfield.training.options import TrainingOptions
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Presets of the recipe, and the part of the capture to train on."""
+
+    preset: str = ""
+    """Names of presets, separated by commas; `sharpfield recipes describe RECIPE` lists them. By
+    default they follow the capture and the device."""
+    use: tuple[str, ...] = ("frames", "events")
+    """Streams of the capture to train on."""
+    block: str = ""
+    """Block of a long capture, 2/4 for the second of four; see `sharpfield blocks`."""
+    seed: int = 0
+    """Random seed."""
+    change: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE ...")] = ()
+    """Options of the recipe, as events.weight=0; better written --events.weight 0."""
+
+
+SELECTION, TRAINING = Selection(), TrainingOptions()
+
+
+def train_command(
+    recipe: Positional[str],
+    capture: Positional[Path],
+    out: Path,
+    device: Device = "auto",
+    selection: Selection = SELECTION,
+    training: TrainingOptions = TRAINING,
+    reading: ReadOptions = NO_OPTIONS,
+    numbers: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
+    """Train a recipe on a capture. `sharpfield train RECIPE --help` lists the options of a recipe.
+
+    Args:
+        recipe: Name of the recipe; `sharpfield recipes` lists them.
+        capture: Folder of the capture.
+        out: Folder of the run, which must be new unless you resume.
+        device: Device to train on.
+        selection: Presets, streams, block, seed.
+        training: How long, how often to save, how much memory.
+        reading: How to read the capture, where its layout is wrong or silent.
+        numbers: Options of the recipe by name, such as sampling.views.
+    """
+    from sharpfield.captures.read import read_capture
+    from sharpfield.recipes.settings.options import changed, with_options
+    from sharpfield.recipes.settings.presets import prepared
+    from sharpfield.runs.config import RunConfig, device_named
+    from sharpfield.runs.start import train_run
+
+    hint_at_flags(recipe, selection.change)
+    console, where = screen(), device_named(device)
+    source = read_capture(capture, reading)
+    made = prepared(recipe, selection.preset, capture=source, device=where)
+    made = with_options(changed(made, selection.change), numbers)
+    where_from = str(capture.resolve())
+    started = RunConfig(
+        recipe, made, where_from, selection.seed, selection.use, reading, selection.block
+    )
+    trained = train_run(started, source, out, training, device=where, console=console)
+    if trained.status.finished:
+        console.print(f"Done. `sharpfield evaluate {out}` measures it.")
 
 
 @dataclass(frozen=True)
@@ -25,7 +90,7 @@ class BlockSelection(Selection):
     """Number of blocks that the capture is divided into."""
 
 
-SELECTION = BlockSelection()
+BLOCK_SELECTION = BlockSelection()
 
 
 def blocks_command(
@@ -33,7 +98,7 @@ def blocks_command(
     capture: Positional[Path],
     out: Path,
     device: Device = "auto",
-    selection: BlockSelection = SELECTION,
+    selection: BlockSelection = BLOCK_SELECTION,
     training: TrainingOptions = TRAINING,
     reading: ReadOptions = NO_OPTIONS,
     numbers: Mapping[str, Any] = MappingProxyType({}),
