@@ -30,8 +30,8 @@ from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.recipes.ev_deblur_nerf import EvDeblurNeRF, Model
 from sharpfield.simulation.static_capture import Rig, simulate
+from sharpfield.training.memory import available_bytes, saved_bytes
 from sharpfield.training.optim import adam
-from sharpfield.training.plan import available_bytes, saved_bytes
 
 ATELIER = Path(__file__).parents[1].parent / "shared" / "data" / "blender" / "atelier"
 """The usual capture, 300x200; simulated where it is absent."""

@@ -22,8 +22,9 @@ from sharpfield.core.protocols import Paper
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
 from sharpfield.recipes.nerf import NeRF, draft
-from sharpfield.training.loop import every, fit
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
+from sharpfield.training.session import every
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from torch import Tensor
 
 from sharpfield.events.double_integral import latent, path_of_slices
 from sharpfield.events.log_path import LogPath
-from sharpfield.events.threshold import FixedThresholds, best_threshold, disagreement
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import best_threshold, disagreement
 from sharpfield.storage.images import list_images, read_images, write_image
 
 JUDGED = 12

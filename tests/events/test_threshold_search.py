@@ -7,9 +7,9 @@ import torch
 from sharpfield.core.events import EventStream
 from sharpfield.core.seed import generator
 from sharpfield.events.log_path import LogPath, change_between, exposure_path, pixel_spread
-from sharpfield.events.threshold import (
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import (
     USUAL,
-    FixedThresholds,
     best_threshold,
     best_thresholds,
     disagreement,

@@ -7,7 +7,7 @@ from torch import Tensor
 from sharpfield.core.seed import generator
 from sharpfield.fields.plane_grid import HeadSize, PlaneHead
 from sharpfield.ops.encoding import frequencies
-from sharpfield.rendering import head_compositing as module
+from sharpfield.rendering import coarse_to_fine as module
 from sharpfield.rendering.coarse_to_fine import Compositing, RayPoints, RenderedRays, composite_head
 
 RAYS, SAMPLES, LOOKED = 11, 24, 5

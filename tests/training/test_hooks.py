@@ -2,8 +2,9 @@ import pytest
 import torch
 
 from sharpfield.core.errors import RunError
-from sharpfield.training.loop import describe, every, every_seconds, fit, require_finite
+from sharpfield.training.loop import fit
 from sharpfield.training.optim import adam
+from sharpfield.training.session import describe, every, every_seconds, require_finite
 from tests.training.toy import Toy
 
 

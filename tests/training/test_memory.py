@@ -4,7 +4,7 @@ from torch import nn
 
 from sharpfield.core.errors import OptionError
 from sharpfield.training import plan as memory
-from sharpfield.training.plan import accumulate, plan_micro_batches, saved_bytes, split_batch
+from sharpfield.training.memory import accumulate, plan_micro_batches, saved_bytes, split_batch
 from tests.training.toy import Toy
 
 

@@ -143,7 +143,7 @@ def events_command(
         device: Device to render on.
     """
     extra.expect_comparable(viewpoint)
-    from sharpfield.runs.events import write_events
+    from sharpfield.runs.event_files import write_events
     from sharpfield.runs.run import open_run
     from sharpfield.storage.event_writer import expect_format
 

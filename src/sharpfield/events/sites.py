@@ -6,20 +6,17 @@ the bits of their coordinates: two events are of one site if their positions are
 Cameras of several tracks have their own sites: first all of track 0, then those of track 1.
 
 On a colour sensor each site is behind one colour filter, see `events.site_colour`.
-
-Which colour filter lies before each site of an event camera.
 """
 
 from collections.abc import Callable, Iterator
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float32, Int8, Int32, Int64, Shaped, UInt32, UInt64
+from jaxtyping import Float32, Int32, Int64, Shaped, UInt32, UInt64
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream
-from sharpfield.events.index import EventIndex, sites_at
 
 CHUNK = 2**22
 """Events processed at once; bounds the temporary memory."""
@@ -184,53 +181,3 @@ def _look_up(
     for i in range(x.size):
         number[i] = table[_slot(_key(x[i], y[i]), table, keys)]
     return number
-
-
-CHANNELS = {"R": 0, "G": 1, "B": 2}
-
-
-def site_channels(events: EventStream, index: EventIndex) -> Int8[np.ndarray, "m"] | None:
-    """0 red, 1 green or 2 blue for each site of the index; None on a mono sensor.
-
-    Raises:
-        CaptureError: The tile is not known, a site that fires has no colour, or has two.
-    """
-    if events.site_colour is not None:
-        return _looked_up(events, index)
-    if events.bayer:
-        return _tiled(events, index)
-    return None
-
-
-def _tiled(events: EventStream, index: EventIndex) -> Int8[np.ndarray, "m"]:
-    if len(events.bayer) != 4 or not set(events.bayer) <= CHANNELS.keys() or events.rectified:
-        raise CaptureError(
-            "a colour filter tile is four letters, and for integer coordinates only",
-            got=f"{events.bayer!r}, {'rectified' if events.rectified else 'integer'} coordinates",
-            do="e.g. RGGB; give rectified positions their colours one by one",
-        )
-    tile = np.array([CHANNELS[letter] for letter in events.bayer], np.int8)
-    column, row = index.site_xy.astype(np.int64).T
-    return tile[2 * (row % 2) + column % 2]
-
-
-def _looked_up(events: EventStream, index: EventIndex) -> Int8[np.ndarray, "m"]:
-    known = events.site_colour
-    assert known is not None, "only called where colours are given"
-    site = sites_at(index, np.stack([known.x, known.y], -1).astype(np.float32))
-    found = site >= 0
-    channel = np.full(index.sites, -1, np.int8)
-    channel[site[found]] = known.channel[found]
-    twice = found & (channel[site] != known.channel)
-    silent = np.diff(index.offset) == 0
-    unknown = np.flatnonzero((channel < 0) & ~silent)
-    if twice.any() or len(unknown):
-        what = "has two colours" if twice.any() else "has no colour"
-        x, y = index.site_xy[site[twice][0] if twice.any() else unknown[0]]
-        raise CaptureError(
-            f"a pixel of the event camera {what}",
-            where=f"rectified position ({x}, {y})",
-            got=f"{int(twice.sum())} with two, {len(unknown)} without, of {index.sites}",
-            do="the map of rectified positions must hold exactly the positions of the events",
-        )
-    return np.maximum(channel, 0)

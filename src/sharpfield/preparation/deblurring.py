@@ -20,7 +20,8 @@ from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import luma, tone_of
 from sharpfield.events.counts import EventMotion
 from sharpfield.events.double_integral import FLOOR, joint_latents, latent, published
-from sharpfield.events.threshold import FixedThresholds, edge_density
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import edge_density
 from sharpfield.metrics.image import gradient_energy, psnr
 from sharpfield.preparation.options import DeblurOptions
 from sharpfield.preparation.thresholds import (

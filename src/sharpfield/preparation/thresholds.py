@@ -13,8 +13,8 @@ from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import Tone, luma, tone_of
 from sharpfield.events.counts import EventMotion
 from sharpfield.events.double_integral import latent
-from sharpfield.events.threshold import (
-    FixedThresholds,
+from sharpfield.events.threshold import FixedThresholds
+from sharpfield.events.threshold_search import (
     best_threshold,
     best_thresholds,
     disagreement,

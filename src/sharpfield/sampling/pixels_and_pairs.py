@@ -26,6 +26,7 @@ from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.measurements import EventPairs, Pixels
 from sharpfield.core.seed import number, numpy_generator, shuffled
+from sharpfield.events.counts import site_channels
 from sharpfield.events.index import (
     EventIndex,
     chain_start,
@@ -34,7 +35,6 @@ from sharpfield.events.index import (
     next_event,
     previous_event,
 )
-from sharpfield.events.sites import site_channels
 
 Device = torch.device | str
 

@@ -22,7 +22,7 @@ from torch.optim import Optimizer
 
 from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Model
-from sharpfield.training.plan import Losses
+from sharpfield.training.memory import Losses
 
 LINE_SECONDS = 10.0
 """Seconds between lines where the output is a file or a pipe."""

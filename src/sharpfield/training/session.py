@@ -1,4 +1,7 @@
-"""A whole run: plan it, train, save, log, stop at a signal or when time is up, and resume."""
+"""A whole run: plan it, train, save, log, stop at a signal or when time is up, and resume.
+
+Hooks, which are called after each step: functions `(step, model, optimizer, losses)`.
+"""
 
 import dataclasses
 import itertools
@@ -10,9 +13,13 @@ from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any
 
+import torch
 from rich.console import Console
+from torch import Tensor
+from torch.optim import Optimizer
 
 from sharpfield.core.errors import RunError
+from sharpfield.core.measurements import Batch
 from sharpfield.core.protocols import Model
 from sharpfield.core.struct import device_of
 from sharpfield.training.checkpoint import (
@@ -23,11 +30,78 @@ from sharpfield.training.checkpoint import (
     restore,
 )
 from sharpfield.training.log import LogLosses, TrainingLog
-from sharpfield.training.loop import Hook, every, every_seconds, fit, require_finite
+from sharpfield.training.loop import Hook, fit
+from sharpfield.training.memory import Losses
 from sharpfield.training.optim import adam
 from sharpfield.training.options import TrainingOptions
 from sharpfield.training.plan import Build, Plan, make_plan
 from sharpfield.training.status import Checkpointer, TrainingStatus, read_status, write_status
+
+
+def every(steps: int, hook: Hook, *, last: int | None = None) -> Hook:
+    """Call `hook` after every `steps` steps, and after the last of a run of `last` steps."""
+
+    def sometimes(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+        if (step + 1) % steps == 0 or step + 1 == last:
+            hook(step, model, optimizer, losses)
+
+    return sometimes
+
+
+def every_seconds(
+    seconds: float, hook: Hook, *, clock: Callable[[], float] = time.monotonic
+) -> Hook:
+    """Call `hook` after the first step that ends `seconds` or more after the last call."""
+    last = clock()
+
+    def sometimes(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+        nonlocal last
+        if clock() - last >= seconds:
+            hook(step, model, optimizer, losses)
+            last = clock()
+
+    return sometimes
+
+
+def require_finite(step: int, model: Model, optimizer: Optimizer, losses: Losses) -> None:
+    """Stop training at a loss that is not finite.
+
+    Raises:
+        RunError: Names the loss, the step, and the range of each field of the batch.
+    """
+    values = torch.stack(list(losses.values()))
+    if torch.isfinite(values).all():
+        return
+    terms = dict(zip(losses, values.tolist(), strict=True))
+    ill = [name for name, loss in losses.items() if not torch.isfinite(loss)]
+    raise RunError(
+        f"the loss {' and '.join(map(repr, ill))} is not finite",
+        where=f"step {step}; batch: {describe(model.draw(step))}",
+        got=", ".join(f"{name} {value:.4g}" for name, value in terms.items()),
+        do="lower the learning rate, or look for odd values in the batch above;"
+        " the last checkpoint is from before and still good",
+    )
+
+
+def describe(batch: Batch) -> str:
+    """A batch in one line: counts, and the range of each field."""
+    return "; ".join(
+        f"{name} ({len(seen)} {type(seen).__name__}): "
+        + ", ".join(
+            f"{field.name} {_range(value)}"
+            for field in dataclasses.fields(seen)
+            if isinstance(value := getattr(seen, field.name), Tensor)
+        )
+        for name, seen in batch.items()
+    )
+
+
+def _range(values: Tensor) -> str:
+    good = values[torch.isfinite(values)]
+    span = f"{good.min().item():.4g}...{good.max().item():.4g}" if good.numel() else "empty"
+    ill = values.numel() - good.numel()
+    return f"{span} and {ill} not finite" if ill else span
+
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

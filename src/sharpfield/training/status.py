@@ -16,7 +16,7 @@ from sharpfield.core.struct import device_of
 from sharpfield.training.checkpoint import TrainingProgress, save_best, save_last
 from sharpfield.training.log import TrainingLog
 from sharpfield.training.loop import Hook
-from sharpfield.training.plan import Losses, peak_memory_mb
+from sharpfield.training.memory import Losses, peak_memory_mb
 
 
 @dataclass(frozen=True)

@@ -30,9 +30,9 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import Tone, luma, tone_of
+from sharpfield.events.counts import site_channels
 from sharpfield.events.double_integral import FLOOR
 from sharpfield.events.index import EventIndex, first_since
-from sharpfield.events.sites import site_channels
 from sharpfield.preparation.thresholds import BRIGHT, DARK, consecutive_pairs, linear_light
 
 MAX_WEIGHT = 4.0

@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float64, Int64
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import numpy_generator
 from sharpfield.events.index import EventIndex
-from sharpfield.events.threshold import HIGHEST, LOWEST, USUAL
+from sharpfield.events.threshold_search import HIGHEST, LOWEST, USUAL
 from sharpfield.preparation.calibrate.exposure_pairs import (
     ExposurePair,
     at_sites,

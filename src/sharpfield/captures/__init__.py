@@ -1,1 +1,0 @@
-"""Captures on disk: layouts of data sets, our own layout, trajectories, writers and summaries."""

@@ -1,1 +1,0 @@
-"""How good a trained model is, in numbers and in images."""

@@ -1,1 +1,0 @@
-"""Fields: what a sharp scene emits, at points, in directions, at times."""

@@ -1,1 +1,0 @@
-"""From a measurement to the sharp rays behind it, and from their light to what is reported."""

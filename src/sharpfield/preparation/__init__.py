@@ -1,1 +1,0 @@
-"""Before training: make the most of a recording."""

@@ -1,1 +1,0 @@
-"""Files of captures and recordings alike: events, images, arrays, and the disk cache."""
