@@ -137,7 +137,7 @@ class Plain(nn.Module):
 
         rigid = weighted(found, rays.weight)
         adaptive = weighted(found, adaptive_weights(self.adaptive, found, code))
-        tone, trusted = frames.tone, frames.trusted(step + 1)
+        tone, trusted = frames.tone, frames.share(step + 1)
         terms = {"adaptive": trusted * mse(tone(adaptive["rgb"]), seen.value)}
         if step + 1 >= frames.frames_from:
             error = mse(tone(rigid["rgb"]), seen.value) + mse(tone(rigid["rgb_coarse"]), seen.value)

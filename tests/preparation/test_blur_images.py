@@ -39,7 +39,9 @@ def test_nothing_is_left_when_a_image_cannot_be_read(folder, tmp_path):
 
 
 def test_other_folders_are_not_replaced(folder, tmp_path):
-    with pytest.raises(CaptureError, match="will not replace what is not a folder of blurred"):
+    with pytest.raises(
+        CaptureError, match="will not replace a folder that is not an earlier result"
+    ):
         blur_images(folder, folder)
     (tmp_path / "empty").mkdir()
     with pytest.raises(CaptureError, match="there are no images"):

@@ -229,7 +229,7 @@ def test_sources_see_what_their_pixels_show_and_nothing_behind_walls():
 
 
 def test_blur_on_single_pixels_is_refused_in_words():
-    with pytest.raises(OptionError, match="blur is modelled on patches, and single pixels are"):
+    with pytest.raises(OptionError, match="blur needs patches, and single pixels are sampled"):
         Hybrid(sampling=PIXELS, **SMALL).build(box(), 0)
 
 

@@ -116,7 +116,7 @@ def test_where_a_lens_sees_very_wide_images_are_coarser():
 
 def test_a_lens_that_sees_behind_itself_is_refused():
     fish = Camera(60, 44, 18.0, 18.0, 30.0, 22.0, "fisheye", (0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(OptionError, match="sees too wide") as refused:
+    with pytest.raises(OptionError, match="field of view is too wide") as refused:
         flattened(fish)
     assert "116 degrees from the optical axis" in str(refused.value)
     assert torch.rad2deg(torch.tensor(STEEPEST).atan()) > 75

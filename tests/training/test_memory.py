@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from sharpfield.core.errors import OptionError
-from sharpfield.training import plan as memory
+from sharpfield.training import memory
 from sharpfield.training.memory import accumulate, plan_micro_batches, saved_bytes, split_batch
 from tests.training.toy import Toy
 
@@ -116,7 +116,7 @@ def test_what_cannot_fit_is_refused():
     assert str(error.value).splitlines() == [
         "OptionError: one training step does not fit in the memory budget, however it is split",
         "  got    a budget of 0.00 GiB, at least 0.00 GiB needed",
-        "  do     raise --memory-gb, or choose a smaller preset",
+        "  do     raise `memory_gb` (--memory-gb), or choose a smaller preset",
     ]
 
 

@@ -22,7 +22,7 @@ from sharpfield.twin.event_twin import (
     resized_camera,
     track_viewpoint,
 )
-from sharpfield.twin.match import match_thresholds
+from sharpfield.twin.agreement import match_thresholds
 from sharpfield.twin.options import ExtraOptions, PixelOptions, ViewpointOptions
 from sharpfield.twin.options import microseconds as us
 from sharpfield.twin.output import (
