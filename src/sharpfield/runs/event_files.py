@@ -14,6 +14,7 @@ from sharpfield.report.event_frames import windows
 from sharpfield.runs.events import event_sensor, whole_steps
 from sharpfield.runs.run import Run
 from sharpfield.simulation.sensors.event_pixels import EventSensor
+from sharpfield.twin.agreement import match_thresholds
 from sharpfield.twin.event_twin import (
     EventTwin,
     Viewpoint,
@@ -22,7 +23,6 @@ from sharpfield.twin.event_twin import (
     resized_camera,
     track_viewpoint,
 )
-from sharpfield.twin.agreement import match_thresholds
 from sharpfield.twin.options import ExtraOptions, PixelOptions, ViewpointOptions
 from sharpfield.twin.options import microseconds as us
 from sharpfield.twin.output import (
