@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 
 help:
 	@echo "make demo    blurry frames and events in, a sharp scene and its report out (runs/demo)"
-	@echo "make test    the whole test suite"
+	@echo "make test    the whole test suite, on all cores"
 	@echo "make lint    ruff and pyright"
 	@echo "make bench   time and memory of one training step, ours against the plain formulation"
 	@echo "make clean   remove the environment and the caches"
@@ -35,7 +35,7 @@ demo: $(STAMP)
 	$(BIN)/sharpfield demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto
 
 lint: $(STAMP)
 	$(BIN)/ruff check
