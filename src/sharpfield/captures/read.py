@@ -7,7 +7,7 @@ from sharpfield.captures.layout import FOR_ALL, NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.native.layout import expect_poses
 from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.capture import Capture, Thresholds
-from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
+from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.plugins import Registry
 
 _ROOM = "sharpfield.captures"
@@ -24,8 +24,8 @@ LAYOUTS = Registry(
         "sens": f"{_ROOM}.layouts.sens_file:LAYOUT",
         "arkitscenes": f"{_ROOM}.layouts.arkitscenes:LAYOUT",
         "7-scenes": f"{_ROOM}.layouts.seven_scenes:LAYOUT",
-        "d-nerf": f"{_ROOM}.layouts.d_nerf:LAYOUT",
-        "nerf-synthetic": f"{_ROOM}.layouts.nerf_synthetic:LAYOUT",
+        "d-nerf": f"{_ROOM}.layouts.blender:D_NERF",
+        "nerf-synthetic": f"{_ROOM}.layouts.blender:NERF",
         "nerfstudio": f"{_ROOM}.layouts.nerfstudio:LAYOUT",
         "colmap": f"{_ROOM}.layouts.colmap:LAYOUT",
     },
@@ -48,7 +48,7 @@ def read_capture(
         OptionError: An option does not fit the layout.
     """
     folder = Path(folder)
-    layout = layout_named(options.layout or layout_of(folder))
+    layout: Layout = LAYOUTS.named(options.layout or layout_of(folder), "layout")
     for name in options.given().keys() - {*FOR_ALL, *layout.options}:
         others = [known for known, one in LAYOUTS.working().items() if name in one.options]
         raise OptionError(
@@ -60,18 +60,6 @@ def read_capture(
     if poses:
         expect_poses(capture, folder)
     return _with_options(capture, options)
-
-
-def layout_named(name: str) -> Layout:
-    """A layout by its name.
-
-    Raises:
-        OptionError: There is none of this name.
-    """
-    layout = LAYOUTS.get(name)
-    if layout is None:
-        raise OptionError("unknown layout", got=name, do=did_you_mean(name, LAYOUTS))
-    return layout
 
 
 def layout_of(folder: Path) -> str:

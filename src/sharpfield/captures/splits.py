@@ -1,16 +1,15 @@
-"""Split a long capture into blocks that are trained separately, on one or several computers.
+"""Which frames are trained on: rules to hold out test frames, and blocks of a long capture.
 
-Space is cut into slabs perpendicular to the principal axis of the visible scene, so that each slab
-is seen by about the same number of pixels. A block is trained on the training frames that see
-enough of its slab or of its margins: blocks overlap. Nothing else about the capture changes, so the
-models of all blocks share one world, and merging keeps of each model what lies in its own slab.
+Published data sets hold out test frames by a rule, written `every:8` (frames 0, 8, 16, ...),
+`train:5` (all but frames 0, 5, 10, ...), `last:5` or `none`.
+
+A long capture is split into blocks that are trained separately, on one or several computers. Space
+is cut into slabs perpendicular to the principal axis of the visible scene, so that each slab is
+seen by about the same number of pixels. A block is trained on the training frames that see enough
+of its slab or of its margins: blocks overlap. Nothing else about the capture changes, so the models
+of all blocks share one world, and merging keeps of each model what lies in its own slab.
 
 Source: block-wise training as in Block-NeRF (CVPR 2022) and VastGaussian (CVPR 2024).
-
-Rules by which published data sets hold out test frames.
-
-A rule is written `every:8` (frames 0, 8, 16, ...), `train:5` (all but frames 0, 5, 10, ...),
-`last:5` or `none`.
 """
 
 import re

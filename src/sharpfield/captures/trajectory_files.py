@@ -95,26 +95,15 @@ def _native(path: Path) -> Path3:
 
 
 def _tum(path: Path) -> Path3:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an empty file is refused below
-            rows = np.loadtxt(path, ndmin=2)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise _not_tum(path, error) from None
-    if not rows.size or rows.shape[1] != TUM_COLUMNS:
-        raise _not_tum(path, f"{rows.shape[1]} columns" if rows.size else "no poses")
+    expected = (
+        "a text with a line `t x y z qx qy qz qw` per pose (t in seconds), or the"
+        " trajectory.npz of a capture"
+    )
+    rows = _numbers(path, None, expected)
+    if rows.shape[1] != TUM_COLUMNS:
+        raise _malformed(path, f"{rows.shape[1]} columns", expected)
     poses = poses_of_quaternions(rows[:, 1:], path, do="the columns are t x y z qx qy qz qw")
     return np.rint(rows[:, 0] * 1e6).astype(np.int64), poses
-
-
-def _not_tum(path: Path, got: object) -> CaptureError:
-    return CaptureError(
-        "cannot read the trajectory",
-        where=path,
-        got=got,
-        do="write a text with a line `t x y z qx qy qz qw` per pose (t in seconds), or give the"
-        " trajectory.npz of a capture",
-    )
 
 
 PathLayout = Literal["tum", "euroc", "kitti", "csv", "npz", "colmap"]
@@ -321,15 +310,17 @@ def _orthonormal(poses: Float64[np.ndarray, "p 3 4"]) -> Float64[np.ndarray, "p 
     return np.concatenate([rotation, poses[:, :, 3:]], -1)
 
 
-def _numbers(path: Path, delimiter: str | None) -> Float64[np.ndarray, "n m"]:
+def _numbers(
+    path: Path, delimiter: str | None, expected: str = "lines of numbers, all of one length"
+) -> Float64[np.ndarray, "n m"]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty file is refused below
             rows = np.loadtxt(path, delimiter=delimiter, ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
-        raise _malformed(path, error, "lines of numbers, all of one length") from None
+        raise _malformed(path, error, expected) from None
     if not rows.size:
-        raise _malformed(path, "no numbers", "lines of numbers, all of one length")
+        raise _malformed(path, "no numbers", expected)
     return rows
 
 

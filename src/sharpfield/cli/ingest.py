@@ -33,7 +33,7 @@ from sharpfield.preparation.ingest.options import (
     Timing,
     fixed_axes,
 )
-from sharpfield.recordings.open import format_named, format_of, open_recording
+from sharpfield.recordings.open import FORMATS, format_of, open_recording
 from sharpfield.recordings.recording import Format, ReaderOptions, Recording
 
 FRAMES_ONLY = ("video", "images")
@@ -89,8 +89,8 @@ class Source(ReaderOptions):
     def format(self, path: Path) -> Format:
         """Format of a file; `layout` names that of the events."""
         if self.layout is None or (path.is_dir() and format_of(path) in FRAMES_ONLY):
-            return format_named(format_of(path))
-        return format_named(self.layout)
+            return FORMATS.named(format_of(path), "format")
+        return FORMATS.named(self.layout, "format")
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,10 @@ class Camera:
 
     def scaled(self, factor: float) -> "Camera":
         """The same camera with an image `factor` times as large."""
-        width, height = round(self.width * factor), round(self.height * factor)
+        return self.resized(round(self.width * factor), round(self.height * factor))
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera with an image of another size."""
         sx, sy = width / self.width, height / self.height
         return replace(
             self,

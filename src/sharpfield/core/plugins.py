@@ -16,7 +16,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar, cast
 
-from sharpfield.core.errors import Hint
+from sharpfield.core.errors import Hint, OptionError, did_you_mean
 
 
 class PluginWarning(Hint):
@@ -60,6 +60,17 @@ class Registry(Mapping[str, T]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
+
+    def named(self, name: str, what: str) -> T:
+        """The object of this name; `what` says in one word what the objects are.
+
+        Raises:
+            OptionError: There is none of this name.
+        """
+        found = self.get(name)
+        if found is None:
+            raise OptionError(f"unknown {what}", got=name, do=did_you_mean(name, self))
+        return found
 
     def working(self) -> dict[str, T]:
         """All objects that can be loaded."""

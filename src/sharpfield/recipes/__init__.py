@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sharpfield.core.errors import OptionError, did_you_mean
 from sharpfield.core.plugins import Registry
 
 if TYPE_CHECKING:  # the names of recipes are known without importing torch
@@ -44,10 +43,7 @@ def recipe_named(name: str) -> "type[Recipe]":
     Raises:
         OptionError: There is none of this name.
     """
-    recipe = RECIPES.get(name)
-    if recipe is None:
-        raise OptionError("unknown recipe", got=name, do=did_you_mean(name, RECIPES))
-    return recipe
+    return RECIPES.named(name, "recipe")
 
 
 def summaries() -> dict[str, str]:

@@ -85,14 +85,6 @@ def decompress(data: Bytes, compression: str) -> Bytes:
     return _DECOMPRESSORS[compression](data)
 
 
-def _none(data: Bytes) -> Bytes:
-    return data
-
-
-def _bz2(data: Bytes) -> bytes:
-    return _decompressed(bz2.BZ2Decompressor(), data, OSError)
-
-
 def _lz4(data: Bytes) -> bytes:
     frame: Any = need("lz4.frame", extra="io", purpose="reading a recording compressed with LZ4")
     return _decompressed(frame.LZ4FrameDecompressor(), data, RuntimeError)
@@ -138,8 +130,8 @@ def _joined(parts: Iterator[bytes]) -> bytes:
 
 
 _DECOMPRESSORS: dict[str, Callable[[Bytes], Bytes]] = {
-    "none": _none,
-    "bz2": _bz2,
+    "none": lambda data: data,
+    "bz2": lambda data: _decompressed(bz2.BZ2Decompressor(), data, OSError),
     "lz4": _lz4,
     "zstd": _zstd,
 }

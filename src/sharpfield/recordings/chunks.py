@@ -164,7 +164,7 @@ class ReorderBuffer:
             last: Whether no more events will come, so that none is held back.
         """
         x, y, t, p = (column[: self.end] for column in self.columns)
-        if not _ascending(t):
+        if (t[1:] < t[:-1]).any():
             _sort(x, y, t, p)
         cut = len(t)
         if not last and cut:
@@ -188,8 +188,7 @@ class _Validator:
     def validated(self, raw: RawChunk) -> RawChunk:
         """The valid events of the next chunk."""
         if not _all_valid(raw.x, raw.y, raw.t_us, *self._size, self._last_us):
-            outside, backward = _count_invalid(raw.x, raw.y, raw.t_us, *self._size, self._last_us)
-            keep = _valid(raw.x, raw.y, raw.t_us, *self._size, self._last_us)
+            keep, outside, backward = _valid(raw.x, raw.y, raw.t_us, *self._size, self._last_us)
             self._count(raw, outside, backward, keep)
             raw = raw[keep]
         self._valid += len(raw)
@@ -223,22 +222,16 @@ class _Validator:
 def _concatenated(chunks: list[RawChunk]) -> RawChunk:
     if len(chunks) == 1:
         return chunks[0]
-    return RawChunk(
-        x=np.concatenate([chunk.x for chunk in chunks]),
-        y=np.concatenate([chunk.y for chunk in chunks]),
-        t_us=np.concatenate([chunk.t_us for chunk in chunks]),
-        p=np.concatenate([chunk.p for chunk in chunks]),
-    )
+    names = ("x", "y", "t_us", "p")
+    return RawChunk(*(np.concatenate([getattr(one, name) for one in chunks]) for name in names))
 
 
 def _stream(chunk: RawChunk, size: tuple[int, int]) -> EventStream:
     return EventStream(chunk.x, chunk.y, chunk.t_us, chunk.p, width=size[0], height=size[1])
 
 
-def _columns() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    kinds = (np.uint16, np.uint16, np.int64, np.int8)
-    x, y, t, p = (np.empty(CHUNK, kind) for kind in kinds)
-    return x, y, t, p
+def _columns() -> tuple[np.ndarray, ...]:
+    return tuple(np.empty(CHUNK, kind) for kind in (np.uint16, np.uint16, np.int64, np.int8))
 
 
 @njit(cache=True, nogil=True)
@@ -256,38 +249,17 @@ def _all_valid(x, y, t_us, width, height, last_us):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _count_invalid(x, y, t_us, width, height, last_us):
-    """Number of events outside the sensor, and of those inside that go back in time."""
-    outside = backward = 0
+def _valid(x, y, t_us, width, height, last_us):
+    """Mask of the valid events; how many lie outside the sensor, and how many others go back."""
+    keep, outside, backward = np.zeros(t_us.size, np.bool_), 0, 0
     for i in range(t_us.size):
         if x[i] >= width or y[i] >= height:
             outside += 1
         elif t_us[i] < last_us:
             backward += 1
         else:
-            last_us = t_us[i]
-    return outside, backward
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _valid(x, y, t_us, width, height, last_us):
-    """Mask of the valid events."""
-    keep = np.zeros(t_us.size, np.bool_)
-    for i in range(t_us.size):
-        if x[i] < width and y[i] < height and t_us[i] >= last_us:
-            keep[i] = True
-            last_us = t_us[i]
-    return keep
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _ascending(t):
-    backward = 0
-    for i in range(1, t.size):
-        backward += t[i] < t[i - 1]
-    return backward == 0
+            keep[i], last_us = True, t_us[i]
+    return keep, outside, backward
 
 
 @njit(cache=True, nogil=True)

@@ -7,7 +7,7 @@ times, sensor resolution, which of several cameras), the error names the option 
 
 from pathlib import Path
 
-from sharpfield.core.errors import CaptureError, OptionError, did_you_mean
+from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.plugins import Registry
 from sharpfield.recordings.recording import NO_OPTIONS, Format, ReaderOptions, Recording
 
@@ -52,7 +52,7 @@ def open_recording(
         OptionError: An option does not belong to the format.
     """
     path = Path(path)
-    known = format_named(layout or format_of(path))
+    known: Format = FORMATS.named(layout or format_of(path), "format")
     for option in sorted(options.given().keys() - set(known.options)):
         others = [one.name for one in FORMATS.working().values() if option in one.options]
         raise OptionError(
@@ -61,17 +61,6 @@ def open_recording(
             do=f"it belongs to {', '.join(others)}",
         )
     return known.open(path, options)
-
-
-def format_named(name: str) -> Format:
-    """A format by its name.
-
-    Raises:
-        OptionError: There is none of this name.
-    """
-    if name not in FORMATS:
-        raise OptionError("unknown format", got=name, do=did_you_mean(name, FORMATS))
-    return FORMATS[name]
 
 
 def format_of(path: Path) -> str:

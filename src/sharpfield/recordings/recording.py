@@ -10,7 +10,7 @@ sensor) is counted in a `ReadLog`; a file that is no recording at all raises a `
 """
 
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -132,16 +132,11 @@ class Recording:
             return EventStream(
                 none, none, np.empty(0, np.int64), np.empty(0, np.int8), width, height
             )
-        first = parts[0]
-        return EventStream(
-            x=np.concatenate([part.x for part in parts]),
-            y=np.concatenate([part.y for part in parts]),
-            t_us=np.concatenate([part.t_us for part in parts]),
-            p=np.concatenate([part.p for part in parts]),
-            width=first.width,
-            height=first.height,
-            bayer=first.bayer,
-        )
+        columns = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("x", "y", "t_us", "p")
+        }
+        return replace(parts[0], **columns)
 
 
 @dataclass(frozen=True)
@@ -172,11 +167,7 @@ class ReaderOptions:
 
     def given(self) -> dict[str, Any]:
         """The options that were given, by name."""
-        return {
-            name: value
-            for name in ReaderOptions.__dataclass_fields__
-            if (value := getattr(self, name)) is not None
-        }
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def only(self, names: Collection[str]) -> "ReaderOptions":
         """These options without all others."""

@@ -6,7 +6,9 @@ is opened only when the user asks for it.
 """
 
 import pickle
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
@@ -22,17 +24,23 @@ Array = Shaped[np.ndarray, "..."]
 BLOCK = 1 << 20
 """Bytes that are read at once."""
 
-PICKLED = "allow_pickle"
-"""Part of numpy's error message for files of pickled objects."""
+PICKLED = ("allow_pickle", "Python objects")
+"""Parts of numpy's error messages for files of pickled objects."""
+
+UNREADABLE = (
+    *(OSError, EOFError, ValueError, RuntimeError, SyntaxError, tokenize.TokenError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""Exceptions that reading a part of a damaged file may raise."""
 
 
-def load_array(path: Path) -> Array:
-    """Read the array of an npy file.
+def load_array(path: Path, *, mapped: bool = False) -> Array:
+    """Read the array of an npy file, or map it to memory.
 
     Raises:
         CaptureError: The file is missing, malformed, or holds pickled Python objects.
     """
-    loaded = _load(path)
+    loaded = _load(path, mapped=mapped)
     if not isinstance(loaded, np.ndarray):
         raise CaptureError(
             "expected a single array", where=path, got="an npz archive", do="save it with np.save"
@@ -54,7 +62,7 @@ def load_arrays(path: Path) -> dict[str, Array]:
     with loaded:
         try:
             return {name: loaded[name] for name in loaded.files}
-        except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise _unreadable(path, error) from None
 
 
@@ -99,17 +107,17 @@ def write_arrays(path: Path, arrays: Mapping[str, Array | Column]) -> None:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def _load(path: Path) -> "Array | np.lib.npyio.NpzFile":
+def _load(path: Path, *, mapped: bool = False) -> "Array | np.lib.npyio.NpzFile":
     try:
-        return np.load(path, allow_pickle=False)
+        return np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
     except FileNotFoundError:
         raise CaptureError("file not found", where=path, do="check the path") from None
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise _unreadable(path, error) from None
 
 
 def _unreadable(path: Path, error: Exception) -> CaptureError:
-    if PICKLED in str(error):
+    if any(part in str(error) for part in PICKLED):
         return CaptureError(
             "file holds pickled Python objects, which may run code when loaded",
             where=path,
@@ -130,7 +138,7 @@ BUILDERS = {
 """What numpy's own pickles of arrays call; the last converts text to bytes."""
 
 
-def load_pickled(path: Path) -> list[Shaped[np.ndarray, "..."]]:
+def load_pickled(path: Path) -> list[Array]:
     """Read the arrays of a `.pkl` file, or of an `.npy` file of objects.
 
     Raises:

@@ -1,8 +1,5 @@
 """An open file of events that is read on demand: a time window, a range, or chunk by chunk."""
 
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -15,6 +12,7 @@ from jaxtyping import Int64
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import EventStream, SiteColour, checked
+from sharpfield.storage.arrays import UNREADABLE
 from sharpfield.storage.event_columns import Stored, coordinates, polarity, whole_us
 
 CHUNK = 2**20
@@ -25,12 +23,6 @@ SEARCHED = 2**16
 
 THOUSAND = (300.0, 3000.0)
 """A ratio of two durations in this range is taken for a factor of 1000 between their units."""
-
-UNREADABLE = (
-    *(OSError, EOFError, ValueError, RuntimeError, SyntaxError, tokenize.TokenError),
-    *(zipfile.BadZipFile, zlib.error),
-)
-"""Exceptions that reading a part of a damaged file may raise."""
 
 
 @runtime_checkable
@@ -222,6 +214,22 @@ class EventFile:
                 do="give width and height in pixels",
             )
         return self.size
+
+
+def expect_later(events: EventStream, last_us: int | None, path: Path) -> None:
+    """Check events that are to be written after those up to `last_us`.
+
+    Raises:
+        CaptureError: They are earlier or invalid.
+    """
+    checked(events, f"{path}, being written")
+    if last_us is not None and events.t_us[0] < last_us:
+        raise CaptureError(
+            "appended events begin before the last ones written",
+            where=path,
+            got=f"{events.t_us[0]} us after {last_us} us",
+            do="append chunks in the order of time",
+        )
 
 
 def _unit_hint(ratio: float) -> str:

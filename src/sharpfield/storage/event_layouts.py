@@ -38,8 +38,9 @@ import numpy as np
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.core.events import SiteColour
+from sharpfield.storage.arrays import UNREADABLE
 from sharpfield.storage.event_columns import TableColumn, ZippedColumn, known_unit, whole_us
-from sharpfield.storage.event_file import UNREADABLE, Column, EventFile
+from sharpfield.storage.event_file import Column, EventFile
 from sharpfield.storage.hdf5 import damage_reported, dataset, open_hdf5_file
 
 COLUMNS = ("x", "y", "t", "p")
@@ -233,10 +234,11 @@ def _open_hdf5(path: Path, camera: str | None) -> EventFile:
             holder: Any = file[dialect.events]
             if TRACK in holder:
                 columns[TRACK] = _column(holder, TRACK)
+            indexed = unit == "us" and "ms_to_idx" in file
             opened = replace(
                 opened,
                 offset_us=_offset_us(file, unit or "us"),
-                ms_to_idx=_column(file, "ms_to_idx") if _is_indexed(file, unit) else None,
+                ms_to_idx=_column(file, "ms_to_idx") if indexed else None,
                 bayer=str(file.attrs.get("bayer", "")),
                 site_colour=_site_colour(file),
                 thresholds=_thresholds(file),
@@ -244,10 +246,6 @@ def _open_hdf5(path: Path, camera: str | None) -> EventFile:
             )
         return replace(opened, resources=resources.pop_all())
     raise AssertionError("the block above returns or raises")
-
-
-def _is_indexed(file: h5py.File, unit: str | None) -> bool:
-    return unit == "us" and "ms_to_idx" in file
 
 
 def _integer(file: h5py.File, attribute: str) -> int:

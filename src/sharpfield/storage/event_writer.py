@@ -1,4 +1,12 @@
-"""Writing events in our superset of the DSEC layout, chunk by chunk.
+"""Writing events chunk by chunk, in our superset of the DSEC layout or as the file's suffix says.
+
+    .h5     our own, described below: it states its units and sensor resolution
+    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
+    .csv    a header `t_us,x,y,p`, then one event per line; p is -1 or +1
+    .raw    Prophesee's EVT3, see `storage.evt_writer`
+
+In every format the file appears whole, at the end, or not at all, and one chunk is in memory. Our
+own layout:
 
     events/{x, y, t, p}     t in us after t_offset, p 0 or 1; chunks of 65 536 events
     events/track            the camera of an event, where there are several
@@ -12,15 +20,6 @@ window in about 3 ms; without `hdf5plugin` it is gzip 1 with shuffle, which ever
 
 A long recording is written in parts, which remain when writing is interrupted. `join_events` joins
 them without decompressing: HDF5 chunks are copied as they are.
-
-Writing events in the format given by the suffix of a file name, chunk by chunk.
-
-    .h5     our own, see `storage.event_writer`: it states its units and sensor resolution
-    .npz    arrays x, y, t (us), p (-1 or +1) at the root, and tick_ns (1000), width, height
-    .csv    a header `t_us,x,y,p`, then one event per line; p is -1 or +1
-    .raw    Prophesee's EVT3, see `storage.evt_writer`
-
-In every format the file appears whole, at the end, or not at all, and one chunk is in memory.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,13 +33,14 @@ import numpy as np
 from jaxtyping import UInt64
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.core.events import EventStream, checked
+from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing
 from sharpfield.storage.arrays import Column, write_arrays
-from sharpfield.storage.event_file import CHUNK
+from sharpfield.storage.event_file import CHUNK, expect_later
 from sharpfield.storage.evt_writer import writing_evt
 from sharpfield.storage.hdf5 import compression_plugin
 
+MS_TO_IDX = "ms_to_idx"
 FORMAT, VERSION = "sharpfield-events", 1
 ROWS = 65_536
 """Events per HDF5 chunk, which are decompressed together."""
@@ -79,17 +79,9 @@ class EventWriter:
         """
         if not len(events):
             return
-        checked(events, f"{self._path}, being written")
-        first, last = int(events.t_us[0]), int(events.t_us[-1])
-        if self._last_us is None:
-            self._begin(events)
-        elif first < self._last_us:
-            raise CaptureError(
-                "appended events begin before the last ones written",
-                where=self._path,
-                got=f"{first} us after {self._last_us} us",
-                do="append chunks in the order of time",
-            )
+        expect_later(events, self._last_us, self._path)
+        if self._last_us is None and self._origin_us is None:
+            self._offset_us = int(events.t_us[0]) // 1000 * 1000
         since = events.t_us - self._offset_us
         if not self._long and since[-1] > SHORT_US:
             raise CaptureError(
@@ -102,12 +94,17 @@ class EventWriter:
         if events.track is not None:
             columns["track"] = events.track
         for name, values in columns.items():
+            if name not in self._columns:
+                kind = ("u8" if self._long else "u4") if name == "t" else values.dtype
+                self._columns[name] = self._file.create_dataset(
+                    f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_compression()
+                )
             self._extend(self._columns[name], values)
         known = len(self._ms_to_idx)
         ms = np.arange(known, since[-1] // 1000 + 1)
         self._extend(self._ms_to_idx, self._count + np.searchsorted(since, ms * 1000))
         self._count += len(events)
-        self._last_us = last
+        self._last_us = int(events.t_us[-1])
 
     def finish(self) -> None:
         """Write what is known only at the end."""
@@ -117,23 +114,6 @@ class EventWriter:
             if self._like.track is not None:
                 self._file.create_dataset("events/track", (0,), self._like.track.dtype)
         self._file["t_offset"] = np.int64(self._offset_us)
-
-    def _begin(self, events: EventStream) -> None:
-        """Create the columns, now that their types are known."""
-        if self._origin_us is None:
-            self._offset_us = int(events.t_us[0]) // 1000 * 1000
-        kinds = {
-            "x": events.x.dtype,
-            "y": events.y.dtype,
-            "t": np.uint64 if self._long else np.uint32,
-            "p": np.uint8,
-        }
-        if events.track is not None:
-            kinds["track"] = events.track.dtype
-        for name, kind in kinds.items():
-            self._columns[name] = self._file.create_dataset(
-                f"events/{name}", (0,), kind, maxshape=(None,), chunks=(ROWS,), **_compression()
-            )
 
     @staticmethod
     def _extend(column: h5py.Dataset, values: np.ndarray) -> None:
@@ -190,9 +170,6 @@ def _compression() -> Mapping[str, Any]:
     if plugin is not None:
         return plugin.Blosc(cname="zstd", clevel=1, shuffle=plugin.Blosc.SHUFFLE)
     return {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-
-
-MS_TO_IDX = "ms_to_idx"
 
 
 def join_events(path: Path, parts: Sequence[Path]) -> None:

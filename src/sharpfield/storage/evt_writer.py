@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, no_type_check
 
 import numpy as np
-from jaxtyping import Int64
 from numba import njit
 
 from sharpfield.core.errors import CaptureError, OptionError
-from sharpfield.core.events import EventStream, checked
+from sharpfield.core.events import EventStream
 from sharpfield.core.files import replacing
+from sharpfield.storage.event_file import expect_later
 
 LARGEST = 2048
 """Maximum width and height: coordinates have 11 bits."""
@@ -40,8 +40,6 @@ VECTOR_EVENTS = 5
 HIGH, LOW, ROW = range(3)
 """Indices of the encoder's state: the values of the last words, -1 before the first."""
 
-Encode = Callable[..., Any]
-
 
 @dataclass(frozen=True)
 class Encoding:
@@ -49,7 +47,7 @@ class Encoding:
 
     header: str
     word: str
-    encode: Encode
+    encode: Callable[..., Any]
     period_us: int
     """Period after which its clock wraps."""
 
@@ -72,21 +70,16 @@ class EvtWriter:
         """
         if not len(events):
             return
-        checked(events, f"{self._path}, being written")
+        expect_later(events, self._last_us, self._path)
         _expect_plain(events, self._path)
-        first, last = int(events.t_us[0]), int(events.t_us[-1])
         if self._last_us is None:
-            self._begin(first)
-        elif first < self._last_us:
-            raise CaptureError(
-                "appended events begin before the last ones written",
-                where=self._path,
-                got=f"{first} us after {self._last_us} us",
-                do="append chunks in the order of time",
-            )
-        self._last_us = last
+            self._begin(int(events.t_us[0]))
+        self._last_us = int(events.t_us[-1])
         x, y = events.x.astype(np.int64), events.y.astype(np.int64)
-        self._write(x, y, events.t_us - self._origin_us, events.p)
+        columns, done = (x, y, events.t_us - self._origin_us, events.p), 0
+        while done < len(events):
+            done, count = self._encoding.encode(columns, done, self._state, self._words)
+            self._file.write(self._words[:count].tobytes())
 
     def finish(self) -> None:
         """Write the header, if there was no event."""
@@ -101,18 +94,6 @@ class EvtWriter:
         lines += f"% time_origin_us {self._origin_us}\n" if self._origin_us else ""
         lines += f"% bayer {like.bayer}\n" if like.bayer else ""
         self._file.write(f"{lines}% end\n".encode())
-
-    def _write(
-        self,
-        x: Int64[np.ndarray, "n"],
-        y: Int64[np.ndarray, "n"],
-        t_us: Int64[np.ndarray, "n"],
-        p: np.ndarray,
-    ) -> None:
-        done = 0
-        while done < len(t_us):
-            done, count = self._encoding.encode((x, y, t_us, p), done, self._state, self._words)
-            self._file.write(self._words[:count].tobytes())
 
 
 @contextmanager

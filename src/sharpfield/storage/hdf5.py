@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from sharpfield.core.errors import CaptureError, MissingExtra
-from sharpfield.storage.event_file import UNREADABLE
+from sharpfield.storage.arrays import UNREADABLE
 
 SUPERBLOCK = b"\x89HDF\r\n\x1a\n"
 """Signature of HDF5 files."""

@@ -1,13 +1,13 @@
 """Posed photographs: images with one pose each; motion during the exposure is unknown.
 
-Each photo is a still track of its own and an instant at a made-up time: photo i at i seconds. The
-exposures do not show whether photos are blurred by motion: `Known.motion` is "unknown", which makes
-recipes learn a blur kernel.
+Each photo is a still track of its own and an instant; where its time is unknown, it is made up:
+photo i at i seconds. The exposures do not show whether photos are blurred by motion: `Known.motion`
+is "unknown", which makes recipes learn a blur kernel.
 """
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +25,10 @@ from sharpfield.storage.images import list_images
 SECOND_US = 1_000_000
 
 HOLD_OUT = "every:8"
-"""The hold-out rule of LLFF, see `captures.hold_out`."""
-
+"""The hold-out rule of LLFF, see `captures.splits`."""
 
 PHOTOS = Known(motion="unknown")
 """Knowledge about photos with one pose each: they may be sharp or blurred."""
-
 
 NEAR, FAR = 0.1, 10.0
 """Estimated depth bounds, relative to the distance of the cameras from their common focus."""
@@ -49,6 +47,8 @@ class Photos:
     """It may be for another image size; it is scaled to the images."""
     encoding: str = "srgb"
     """How stored values relate to light, see `Frames`."""
+    taken: tuple[Int64[np.ndarray, "n"], Clock] | None = None
+    """When, in us; by default photo i at i seconds."""
 
 
 def photo_capture(
@@ -75,7 +75,10 @@ def photo_capture(
         notes: Remarks for people.
     """
     count, height, width, _ = photos.images.shape
-    taken_us = np.arange(count, dtype=np.int64) * SECOND_US
+    taken_us, clock = photos.taken or (
+        np.arange(count, dtype=np.int64) * SECOND_US,
+        Clock(0, max(count - 1, 1) * SECOND_US),
+    )
     frames = Frames(
         images=photos.images,
         exposure=Exposure(taken_us, taken_us),
@@ -86,7 +89,7 @@ def photo_capture(
     return Capture(
         camera=scaled_camera(photos.camera, width, height, where=name),
         trajectory=Still(photos.poses),
-        clock=Clock(0, max(count - 1, 1) * SECOND_US),
+        clock=clock,
         near=bounds[0],
         far=bounds[1],
         frames=frames,
@@ -158,15 +161,7 @@ def scaled_camera(camera: Camera, width: int, height: int, *, where: object) -> 
             got=f"images {width}x{height}, intrinsics for {camera.width}x{camera.height}",
             do="give intrinsics for these images; cropping moves the principal point",
         )
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx_px=camera.fx_px * sx,
-        fy_px=camera.fy_px * sy,
-        cx_px=camera.cx_px * sx,
-        cy_px=camera.cy_px * sy,
-    )
+    return camera.resized(width, height)
 
 
 def same_camera(cameras: Sequence[Camera], names: Sequence[str], *, where: object) -> Camera:

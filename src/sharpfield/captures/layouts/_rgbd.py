@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Shaped, UInt8, UInt16
 
 from sharpfield.captures.layouts._photos import Photos, photo_capture
+from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
@@ -35,10 +36,7 @@ LISTED = 6
 """Number of dropped frames that are listed by name."""
 
 PUBLISHED_SPLIT = "train:5"
-"""One frame in five is for training, see `captures.hold_out`."""
-
-Row = int
-"""Index of a frame in its recording."""
+"""One frame in five is for training, see `captures.splits`."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +46,9 @@ class RgbdFrames:
     names: Sequence[str]
     poses: Float64[np.ndarray, "n 3 4"]
     """World-from-camera, OpenCV axes; not finite where tracking failed."""
-    colour: Callable[[Row], UInt8[np.ndarray, "h w 3"]]
-    """Decodes the colour image of a frame."""
-    depth: Callable[[Row], UInt16[np.ndarray, "y x"]] | None
+    colour: Callable[[int], UInt8[np.ndarray, "h w 3"]]
+    """Decodes the colour image of a frame, given its index in the recording."""
+    depth: Callable[[int], UInt16[np.ndarray, "y x"]] | None
     """Decodes the depth of a frame, in mm, 0 where unknown."""
     measured: Bool[np.ndarray, "n"]
     """Which frames have a depth map; without one, depth is unknown in all pixels."""
@@ -65,20 +63,22 @@ class RgbdFrames:
 
 def rgbd_capture(
     frames: RgbdFrames,
-    split: Callable[[int], Split],
+    hold_out: str | None,
     *,
     folder: Path,
     source: str,
     points: Float64[np.ndarray, "m 3"] | None = None,
+    split: Split | None = None,
 ) -> Capture:
     """A capture from a recording of a depth camera.
 
     Args:
         frames: The frames.
-        split: The split for a number of frames, without those whose pose is unusable.
+        hold_out: Rule for the frames whose pose is usable; by default `PUBLISHED_SPLIT`.
         folder: Folder of the recording, which gives its name.
         source: The layout.
         points: Sparse scene points.
+        split: Of the frames whose pose is usable, instead of a rule.
 
     Raises:
         CaptureError: No frame has a pose, or an image cannot be read.
@@ -101,7 +101,13 @@ def rgbd_capture(
     )
     depth = None
     if frames.depth is not None and frames.measured[kept].any():
-        maps = _depth_maps(frames, frames.depth, kept.tolist())
+        decode, unknown = frames.depth, np.zeros(frames.depth_camera.size[::-1], np.uint16)
+        maps = image_stack(
+            kept.tolist(),
+            lambda row: decode(row) if frames.measured[row] else unknown,
+            sources=frames.depth_sources,
+            kind="depth",
+        )
         depth = DepthMaps(maps, frames.depth_camera, MILLIMETRE)
     photos = Photos(
         images=images,
@@ -111,7 +117,7 @@ def rgbd_capture(
     )
     made = photo_capture(
         photos,
-        split(len(kept)),
+        split or split_by_rule(len(kept), hold_out or PUBLISHED_SPLIT),
         bounds=BOUNDS,
         name=folder.resolve().name,
         source=source,
@@ -135,16 +141,7 @@ def downscaled_camera(camera: Camera, largest: tuple[int, int]) -> Camera:
     sx, sy = wide / camera.width, high / camera.height
     if abs(sx / sy - 1) > SAME_ASPECT:
         wide, high = (max(round(side * min(sx, sy)), 1) for side in camera.size)
-        sx, sy = wide / camera.width, high / camera.height
-    return replace(
-        camera,
-        width=wide,
-        height=high,
-        fx_px=camera.fx_px * sx,
-        fy_px=camera.fy_px * sy,
-        cx_px=camera.cx_px * sx,
-        cy_px=camera.cy_px * sy,
-    )
+    return camera.resized(wide, high)
 
 
 def pinhole(matrix: Shaped[np.ndarray, "r c"], size: tuple[int, int], *, where: object) -> Camera:
@@ -230,18 +227,6 @@ def _sized(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> UInt8[np
     if image.shape[1::-1] == size:
         return image
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _depth_maps(
-    frames: RgbdFrames, decode: Callable[[Row], UInt16[np.ndarray, "y x"]], rows: list[Row]
-) -> UInt16[np.ndarray, "m y x"]:
-    unknown = np.zeros(frames.depth_camera.size[::-1], np.uint16)
-    return image_stack(
-        rows,
-        lambda row: decode(row) if frames.measured[row] else unknown,
-        sources=frames.depth_sources,
-        kind="depth",
-    )
 
 
 def _notes(frames: RgbdFrames, usable: Bool[np.ndarray, "n"]) -> dict[str, float | str]:

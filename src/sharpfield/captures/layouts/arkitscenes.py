@@ -21,18 +21,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Shaped
+from jaxtyping import Bool, Float64
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts._rgbd import (
-    PUBLISHED_SPLIT,
-    RgbdFrames,
-    read_matrix,
-    read_rgb,
-    rgbd_capture,
-)
+from sharpfield.captures.layouts._rgbd import RgbdFrames, read_matrix, read_rgb, rgbd_capture
 from sharpfield.captures.native.frames import decode_depth
-from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock
 from sharpfield.core.errors import CaptureError
@@ -85,12 +78,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         sources=colour,
         depth_sources=[path for path, known in zip(maps, measured, strict=True) if known],
     )
-    made = rgbd_capture(
-        frames,
-        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
-        folder=folder,
-        source="arkitscenes",
-    )
+    made = rgbd_capture(frames, options.hold_out, folder=folder, source="arkitscenes")
     return replace(made, notes=made.notes | {"focal_spread": spread})
 
 
@@ -121,7 +109,16 @@ def _depth_of(
 
 def _camera(folder: Path) -> tuple[Camera, float]:
     """The median camera of all frames, and the relative spread of the focal length."""
-    rows = [_pincam(path) for path in sorted((folder / INTRINSICS).glob("*.pincam"))]
+    rows = []
+    for path in sorted((folder / INTRINSICS).glob("*.pincam")):
+        rows.append(read_matrix(path).ravel())
+        if len(rows[-1]) != 6:
+            raise CaptureError(
+                "intrinsics must be six numbers",
+                where=path,
+                got=len(rows[-1]),
+                do="write width height fx fy cx cy",
+            )
     table = np.stack(rows or [np.zeros(6)])
     if not table[:, 2].all():
         raise CaptureError(
@@ -129,18 +126,6 @@ def _camera(folder: Path) -> tuple[Camera, float]:
         )
     width, height, fx, fy, cx, cy = np.median(table, axis=0).tolist()
     return Camera(int(width), int(height), fx, fy, cx, cy), float(np.ptp(table[:, 2]) / fx)
-
-
-def _pincam(path: Path) -> Shaped[np.ndarray, "6"]:
-    row = read_matrix(path).ravel()
-    if len(row) != 6:
-        raise CaptureError(
-            "intrinsics must be six numbers",
-            where=path,
-            got=len(row),
-            do="write width height fx fy cx cy",
-        )
-    return row
 
 
 def _poses(path: Path, times_s: Sequence[float]) -> Float64[np.ndarray, "n 3 4"]:

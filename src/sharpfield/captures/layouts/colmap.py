@@ -330,7 +330,8 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     if model_folder is None:
         raise CaptureError("no COLMAP model", where=folder, do="put one in sparse/0")
     model = read_model(model_folder)
-    paths = _image_paths(choose_images(folder, options.factor), model)
+    image_folder = choose_images(folder, options.factor)
+    paths = [_with_any_suffix(image_folder / name) for name in model.names]
     kept = existing(paths, missing=options.missing, where=model_folder)
     names = [model.names[i] for i in kept]
     photos = Photos(
@@ -350,16 +351,10 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     )
 
 
-def _image_paths(folder: Path, model: Model) -> list[Path]:
-    """The path of each photo; downscaled copies may have another suffix than the model states."""
-    return [_with_any_suffix(folder / name) for name in model.names]
-
-
 def _with_any_suffix(path: Path) -> Path:
-    candidates = [
-        path,
-        *(path.with_suffix(s) for suffix in SUFFIXES for s in (suffix, suffix.upper())),
-    ]
+    """The path of a photo; downscaled copies may have another suffix than the model states."""
+    others = (path.with_suffix(s) for suffix in SUFFIXES for s in (suffix, suffix.upper()))
+    candidates = [path, *others]
     return next((candidate for candidate in candidates if candidate.is_file()), path)
 
 

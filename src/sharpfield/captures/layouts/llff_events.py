@@ -103,7 +103,11 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     exposure = _exposure(image_folder / "timestamps.npz")
     _expect_one_each(folder, images=len(paths), poses=len(table), exposures=len(exposure))
     images = read_images(paths)
-    camera = _camera(images, table, factor=_factor(image_folder))
+    scaled = re.fullmatch(r"images_(\d+)", image_folder.name)
+    focal = table.focal_px / (float(scaled[1]) if scaled else 1.0)
+    height, width = images.shape[1:3]
+    # Of the table only the focal length is used, as the authors do.
+    camera = Camera(width, height, focal, focal, width / 2, height / 2)
     along, path = _trajectory(folder)
     bounds = (along if variant.reference_poses == "trajectory" else table).bounds
     off = _off_trajectory(path, table, exposure, camera, near=float(bounds.min()))
@@ -162,18 +166,6 @@ def _trajectory(folder: Path) -> tuple[PosesBounds, Stamped]:
     _expect_one_each(f"{poses_file} and {times_file.name}", poses=len(table), times=len(times_us))
     clock = Clock(int(times_us[0]), max(int(times_us[-1] - times_us[0]), 1))
     return table, Stamped(times_us, table.poses, clock)
-
-
-def _camera(images: Shaped[np.ndarray, "n h w c"], table: PosesBounds, *, factor: float) -> Camera:
-    """The camera; of the table only the focal length is used, as the authors do."""
-    height, width = images.shape[1:3]
-    focal = table.focal_px / factor
-    return Camera(width, height, focal, focal, width / 2, height / 2)
-
-
-def _factor(images: Path) -> float:
-    match = re.fullmatch(r"images_(\d+)", images.name)
-    return float(match[1]) if match else 1.0
 
 
 def _off_trajectory(

@@ -33,7 +33,6 @@ from sharpfield.captures.layouts._transforms import (
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Clock, Known, Split, Thresholds
 from sharpfield.core.errors import CaptureError
-from sharpfield.core.events import EventStream
 from sharpfield.core.frames import Exposure, Frames
 from sharpfield.core.lenses import PINHOLE, lens_in_calibration
 from sharpfield.geometry import se3
@@ -66,7 +65,8 @@ def read(folder: Path, _options: ReadOptions = NO_OPTIONS) -> Capture:
     calibration = _arrays(folder / CALIBRATION, ("intrinsics", "img_height", "img_width"))
     camera = _camera(calibration, folder / CALIBRATION)
     path = _trajectory(folder / POSES)
-    events = _events(folder / EVENTS, camera, str(calibration.get("bayer_pattern", "")))
+    with open_events(folder / EVENTS, size=camera.size) as file:
+        events = read_events(replace(file, bayer=str(calibration.get("bayer_pattern", ""))))
     near, far = estimated_bounds(path.poses)
     views = _views(folder, camera, path.clock)
     none = np.zeros(0, np.int64)
@@ -137,11 +137,6 @@ def _trajectory(path: Path) -> Stamped:
     times_us = whole_us(stamps, "ns", path)
     clock = Clock(int(times_us[0]), max(int(times_us[-1] - times_us[0]), 1))
     return Stamped(times_us, poses, clock, "linear")
-
-
-def _events(path: Path, camera: Camera, bayer: str) -> EventStream:
-    with open_events(path, size=camera.size) as file:
-        return read_events(replace(file, bayer=bayer))
 
 
 def _known(calibration: Arrays) -> Known:

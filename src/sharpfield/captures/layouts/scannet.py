@@ -22,7 +22,6 @@ from jaxtyping import Float64, Int64
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
-    PUBLISHED_SPLIT,
     RgbdFrames,
     pinhole,
     read_matrix,
@@ -32,7 +31,6 @@ from sharpfield.captures.layouts._rgbd import (
     usable_poses,
 )
 from sharpfield.captures.native.frames import decode_depth
-from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.storage.images import SUFFIXES, image_stack, read_image
@@ -81,11 +79,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         depth_sources=[path for path, known in zip(maps, measured, strict=True) if known],
     )
     made = rgbd_capture(
-        frames,
-        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
-        folder=folder,
-        source="scannet",
-        points=_mesh(folder),
+        frames, options.hold_out, folder=folder, source="scannet", points=_mesh(folder)
     )
     return _with_truth(made, inner, np.flatnonzero(usable_poses(frames.poses)))
 
@@ -93,11 +87,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
 def by_number(folder: Path) -> list[Path]:
     """Images of a folder, in the order of the numbers in their names."""
     found = [path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES]
-    return sorted(found, key=_number)
-
-
-def _number(path: Path) -> tuple[int, Path]:
-    return int("".join(filter(str.isdigit, path.stem)) or -1), path
+    return sorted(found, key=lambda p: (int("".join(filter(str.isdigit, p.stem)) or -1), p))
 
 
 def _inner(folder: Path) -> Path:
@@ -105,10 +95,7 @@ def _inner(folder: Path) -> Path:
 
 
 def _colour(inner: Path) -> list[Path]:
-    for name in COLOUR:
-        if found := by_number(inner / name):
-            return found
-    return []
+    return next(filter(None, (by_number(inner / name) for name in COLOUR)), [])
 
 
 def _pose(path: Path) -> Float64[np.ndarray, "3 4"]:

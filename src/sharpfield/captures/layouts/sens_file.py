@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8, UInt16
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
-from sharpfield.captures.layouts._rgbd import PUBLISHED_SPLIT, RgbdFrames, pinhole, rgbd_capture
-from sharpfield.captures.splits import split_by_rule
+from sharpfield.captures.layouts._rgbd import RgbdFrames, pinhole, rgbd_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
 
@@ -130,12 +129,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         sources=[path],
         depth_sources=[path],
     )
-    return rgbd_capture(
-        frames,
-        lambda count: split_by_rule(count, options.hold_out or PUBLISHED_SPLIT),
-        folder=folder,
-        source="sens",
-    )
+    return rgbd_capture(frames, options.hold_out, folder=folder, source="sens")
 
 
 def open_sens(path: Path) -> SensFile:

@@ -18,7 +18,6 @@ from jaxtyping import UInt16
 
 from sharpfield.captures.layout import NO_OPTIONS, Layout, ReadOptions
 from sharpfield.captures.layouts._rgbd import (
-    PUBLISHED_SPLIT,
     RgbdFrames,
     read_pose,
     read_rgb,
@@ -26,7 +25,6 @@ from sharpfield.captures.layouts._rgbd import (
     usable_poses,
 )
 from sharpfield.captures.native.frames import decode_depth
-from sharpfield.captures.splits import split_by_rule
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture, Split
 from sharpfield.core.errors import CaptureError
@@ -65,7 +63,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
     several = colour[0].parent != folder
     maps = [_beside(path, "depth.png") for path in colour]
     frames = RgbdFrames(
-        names=[_name(path, several) for path in colour],
+        names=[f"{path.parent.name}_" * several + _number(path) for path in colour],
         poses=poses,
         colour=lambda row: read_rgb(colour[row]),
         depth=lambda row: _depth(maps[row]),
@@ -76,12 +74,7 @@ def read(folder: Path, options: ReadOptions = NO_OPTIONS) -> Capture:
         depth_sources=[path for path in maps if path.is_file()],
     )
     return rgbd_capture(
-        frames,
-        lambda count: (
-            _split(folder, usable) or split_by_rule(count, options.hold_out or PUBLISHED_SPLIT)
-        ),
-        folder=folder,
-        source="7-scenes",
+        frames, options.hold_out, folder=folder, source="7-scenes", split=_split(folder, usable)
     )
 
 
@@ -94,9 +87,8 @@ def _beside(colour: Path, ending: str) -> Path:
     return colour.with_name(colour.name.replace("color.png", ending))
 
 
-def _name(path: Path, several: bool) -> str:
-    number = path.name.split(".")[0].removeprefix("frame-")
-    return f"{path.parent.name}_{number}" if several else number
+def _number(path: Path) -> str:
+    return path.name.split(".")[0].removeprefix("frame-")
 
 
 def _split(folder: Path, paths: list[Path]) -> Split | None:

@@ -22,6 +22,7 @@ Source: https://docs.inivation.com, "AEDAT 2.0"; the camera classes of jAER for 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import no_type_check
 
@@ -59,8 +60,6 @@ CAMERAS = {
 }
 """Resolution by a part of the camera's class name."""
 
-DVS128 = CAMERAS["dvs128"]
-
 RESET, SIGNAL, IMU = 0, 1, 3
 BITS = 10
 """Bits of a sample."""
@@ -78,7 +77,7 @@ class Layout:
     @property
     def davis(self) -> bool:
         """Whether the addresses are those of a DAVIS."""
-        return self.size != DVS128
+        return self.size != CAMERAS["dvs128"]
 
 
 def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -95,15 +94,11 @@ def open_aedat2(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     if not start.startswith(FIRST_LINE):
         raise CaptureError("the file is no AEDAT2", where=path, got=start[:16])
     lines, begin = _header(start)
-    chip = next(
-        (line.partition(":")[2] for line in lines if line.startswith("AEChip:")), ""
-    ).strip()
+    chip = next((line[7:].strip() for line in lines if line.startswith("AEChip:")), "")
     stated = next((size for name, size in CAMERAS.items() if name in chip.lower()), None)
     size = resolve_size(stated, options.size, path)
     if size not in CAMERAS.values():
-        known = ", ".join(
-            f"{width} x {height}" for width, height in dict.fromkeys(CAMERAS.values())
-        )
+        known = ", ".join(f"{wide} x {high}" for wide, high in dict.fromkeys(CAMERAS.values()))
         raise CaptureError(
             "addresses of this camera are not known",
             where=path,
@@ -204,7 +199,8 @@ class _Readout:
         """Add samples; yields the previous frame whenever a new one begins."""
         kind = (address >> np.uint32(10) & 3).astype(np.int8)
         # A frame begins where signals end and resets follow, unless both are interleaved.
-        for first, last in _runs(kind):
+        ends = [*(np.flatnonzero(np.diff(kind)) + 1).tolist(), len(kind)] if len(kind) else []
+        for first, last in pairwise([0, *ends]):
             part = int(kind[first])
             if part not in (RESET, SIGNAL):
                 self._layout.log.note("samples of an unknown kind", last - first)
@@ -244,13 +240,6 @@ class _Readout:
         self._samples[part, y[inside], x[inside]] = samples[inside]
         span = self._spans[part] or [int(t_us[0]), int(t_us[0])]
         self._spans[part] = [span[0], int(t_us[-1])]
-
-
-def _runs(kind: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Begin and end index of each run of equal values."""
-    ends = [*(np.flatnonzero(np.diff(kind)) + 1).tolist(), len(kind)]
-    begins = [0, *ends[:-1]]
-    return ((first, last) for first, last in zip(begins, ends, strict=True) if last > first)
 
 
 @njit(cache=True, nogil=True)

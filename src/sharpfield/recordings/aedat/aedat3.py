@@ -132,14 +132,16 @@ def open_aedat3(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     named = re.findall(r"^#Source (\d{1,4}): *([^\r\n]*)", start[:end].decode("latin-1"), re.M)
     sources = {int(number): name.strip() for number, name in named}
     source = _chosen(sources, options.topic, path)
-    size = resolve_size(_size(sources[source]), options.size, path)
+    camera = sources[source].upper()
+    stated = next((size for name, size in SIZES.items() if camera.startswith(name)), None)
+    size = resolve_size(stated, options.size, path)
     layout = Layout(path, end + len(LAST_LINE), source)
     return Recording(
         path,
         "AEDAT3.1",
         size,
         events=partial(_events, layout, size),
-        frames=partial(_frames, layout) if sources[source].upper().startswith("DAVIS") else None,
+        frames=partial(_frames, layout) if camera.startswith("DAVIS") else None,
         triggers=partial(_triggers, layout),
         log=layout.log,
         notes={"camera": sources[source]},
@@ -158,10 +160,6 @@ def _chosen(sources: dict[int, str], topic: str | None, path: Path) -> int:
         got=", ".join(f"{number} {name}" for number, name in sources.items()),
         do="give the number of a source as topic" if sources else "copy it again",
     )
-
-
-def _size(name: str) -> tuple[int, int] | None:
-    return next((size for known, size in SIZES.items() if name.upper().startswith(known)), None)
 
 
 def _events(layout: Layout, size: tuple[int, int]) -> Chunks:

@@ -38,6 +38,10 @@ class Topic(NamedTuple):
     """Whether messages are serialised as in ROS 2."""
 
 
+Connections = dict[int, tuple[str, Topic]]
+"""Name and type of a topic by the number that messages give."""
+
+
 class Message(NamedTuple):
     """A recorded message."""
 
@@ -172,9 +176,6 @@ def open_ros1_bag(path: Path) -> Bag:
         return _messages(path, numbers, log)
 
     return Bag(path, "ROS1 bag", topics, messages)
-
-
-Connections = dict[int, tuple[str, Topic]]
 
 
 def _indexed(path: Path) -> Connections:

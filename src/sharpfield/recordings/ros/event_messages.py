@@ -47,13 +47,6 @@ PADDED_EVENT = np.dtype(
 """ROS 2 aligns numbers, so every event but the first is preceded by three bytes of padding."""
 
 
-class EventHeader(NamedTuple):
-    """Fields that all event messages begin with."""
-
-    stamp_ns: int
-    size: tuple[int, int]
-
-
 class Packet(NamedTuple):
     """Encoded events of one message."""
 
@@ -65,11 +58,11 @@ class Packet(NamedTuple):
     payload: memoryview
 
 
-def event_header(fields: FieldReader) -> EventHeader:
-    """Read time and sensor resolution, with which all event messages begin."""
+def event_header(fields: FieldReader) -> tuple[int, tuple[int, int]]:
+    """Read time in ns and sensor resolution, with which all event messages begin."""
     stamp_ns = fields.header_ns()
     height, width = fields.number("I"), fields.number("I")
-    return EventHeader(stamp_ns, (width, height))
+    return stamp_ns, (width, height)
 
 
 def event_arrays(messages: Iterable[Message], topic: Topic, log: ReadLog) -> Iterator[RawChunk]:

@@ -107,7 +107,9 @@ def open_rosbag(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         events=None if source is None else partial(_events, source, log),
         frames=None if images is None else partial(_frames, bag, images, log),
         triggers=partial(_triggers, source) if source is not None and encoded else None,
-        bayer="" if images is None else _bayer(bag, images),
+        bayer=""
+        if images is None
+        else next((x.bayer for x in _images(bag, images, ReadLog())), ""),
         log=log,
         notes={name: kind for name, (kind, _) in bag.topics.items()},
     )
@@ -186,7 +188,7 @@ def _source(bag: Bag, topic: str, given: tuple[int, int] | None) -> EventSource:
     known, stated, encoding = bag.topics[topic], None, ""
     for message in islice(bag.messages([topic], ReadLog()), FIRST_MESSAGES):
         try:
-            width, height = event_header(FieldReader(message, known)).size
+            _, (width, height) = event_header(FieldReader(message, known))
             encoding = event_packet(message, known).encoding if known.kind in PACKETS else ""
         except DamagedData:
             continue
@@ -257,11 +259,6 @@ def _packets(source: EventSource, log: ReadLog) -> Iterator[Packet]:
             log.note("messages encoded otherwise than the first")
 
 
-def _bayer(bag: Bag, topic: str) -> str:
-    """Colour filter array of the first image."""
-    return next((found.bayer for found in _images(bag, topic, ReadLog())), "")
-
-
 def _frames(bag: Bag, topic: str, log: ReadLog) -> Iterator[Frame]:
     log = log.start("frames")
     ends = _exposure_ends(bag, f"{topic}/exposure", log)
@@ -301,16 +298,14 @@ def _exposure_ends(bag: Bag, topic: str, log: ReadLog) -> dict[int, int]:
     return ends
 
 
-def _recognise(path: Path, head: bytes) -> bool:
-    return head.startswith(tuple(OPENERS)) or (path / "metadata.yaml").is_file()
-
-
 FORMAT = Format(
     "rosbag",
     open_rosbag,
     holds="events, images, triggers",
     marks="a bag of ROS 1, or of ROS 2 (SQLite, MCAP)",
-    recognise=_recognise,
+    recognise=lambda path, head: (
+        head.startswith(tuple(OPENERS)) or (path / "metadata.yaml").is_file()
+    ),
     suffixes=(".bag", ".db3", ".mcap"),
     options=("size", "topic", "image_topic"),
 )

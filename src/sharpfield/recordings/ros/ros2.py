@@ -19,9 +19,9 @@ from sharpfield.recordings.bytes import MAX_BLOCK, Bytes, DamagedData, decompres
 from sharpfield.recordings.recording import ReadLog
 from sharpfield.recordings.ros.bag import (
     Bag,
+    Connections,
     Message,
     ReadBytes,
-    Topic,
     file_reader,
     memory_reader,
     topic_of,
@@ -31,7 +31,6 @@ MCAP_MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
 FOOTER_SIZE = 9 + 20 + len(MCAP_MAGIC)
 
-Channels = dict[int, tuple[str, Topic]]
 Record = tuple[int, Bytes]
 
 
@@ -56,7 +55,7 @@ def open_mcap(path: Path) -> Bag:
     return Bag(path, "ROS2 MCAP", dict(channels.values()), messages)
 
 
-def _summarised(path: Path) -> Channels:
+def _summarised(path: Path) -> Connections:
     """Channels from the summary; empty if there is no summary."""
     length = path.stat().st_size
     if length < len(MCAP_MAGIC) + FOOTER_SIZE:
@@ -69,9 +68,9 @@ def _summarised(path: Path) -> Channels:
     return _channels(_records(path, start, ReadLog()))
 
 
-def _channels(records: Iterator[Record]) -> Channels:
+def _channels(records: Iterator[Record]) -> Connections:
     schemas: dict[int, str] = {}
-    found: Channels = {}
+    found: Connections = {}
     for kind, content in records:
         try:
             if kind == SCHEMA:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Int64, Shaped
 
 from sharpfield.core.errors import CaptureError
-from sharpfield.recordings.chunks import expect_inside
+from sharpfield.recordings.chunks import expect_inside, resolve_size
 from sharpfield.recordings.recording import (
     NO_OPTIONS,
     Chunks,
@@ -41,12 +41,9 @@ from sharpfield.storage.event_file import CHUNK, EventFile
 from sharpfield.storage.event_layouts import CAMERA, find_dialect, open_events
 from sharpfield.storage.hdf5 import SUPERBLOCK, damage_reported, dataset, open_hdf5_file
 
-OpenFile = Callable[[], EventFile]
-"""Opens the file again."""
 
-
-def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
-    """Make a recording of the events of a file.
+def column_recording(layout: str, path: Path, open_file: Callable[[], EventFile]) -> Recording:
+    """Make a recording of the events of a file; `open_file` opens it again.
 
     Raises:
         CaptureError: The file cannot be opened, or its time unit or resolution is unknown.
@@ -54,9 +51,8 @@ def column_recording(layout: str, path: Path, open_file: OpenFile) -> Recording:
     log = ReadLog()
     with open_file() as file:
         _expect_unit(file)
-        _expect_size(file)
-        integral = _integral(file)
-        size, bayer, thresholds = file.size, file.bayer, file.thresholds
+        size, integral = resolve_size(file.size, None, file.path), _integral(file)
+        bayer, thresholds = file.bayer, file.thresholds
 
     def events() -> Chunks:
         with open_file() as opened:
@@ -156,18 +152,6 @@ def _expect_unit(file: EventFile) -> None:
     )
 
 
-def _expect_size(file: EventFile) -> None:
-    if file.size is None:
-        raise CaptureError(
-            "the file does not state its sensor resolution",
-            where=file.path,
-            do="give width and height in pixels",
-        )
-
-
-ReadFrames = Callable[[h5py.File, str], Iterator[Frame]]
-
-
 def open_hdf5(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     """Open an HDF5 file of events.
 
@@ -249,7 +233,7 @@ def _numbered_frames(file: h5py.File, camera: str) -> Iterator[Frame]:
         yield Frame(image[:], t_us, t_us, name)
 
 
-FRAMES: dict[str, tuple[str, ReadFrames]] = {
+FRAMES: dict[str, tuple[str, Callable[[h5py.File, str], Iterator[Frame]]]] = {
     "M3ED": (f"ovc/{CAMERA}/data", _m3ed_frames),
     "MVSEC": (f"davis/{CAMERA}/image_raw", _mvsec_frames),
     "event_utils HDF5": ("images", _numbered_frames),

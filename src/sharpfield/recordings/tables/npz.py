@@ -29,7 +29,6 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped
 
 from sharpfield.core.errors import CaptureError
 from sharpfield.recordings.bytes import read_blocks, read_head, zip_holds
@@ -44,8 +43,9 @@ from sharpfield.recordings.recording import (
     begins_with,
 )
 from sharpfield.recordings.tables.columns import column_recording
+from sharpfield.storage.arrays import Array, load_array
 from sharpfield.storage.event_columns import TableColumn, known_unit
-from sharpfield.storage.event_file import CHUNK, UNREADABLE, EventFile
+from sharpfield.storage.event_file import CHUNK, EventFile
 from sharpfield.storage.event_layouts import npz_dialect, open_events
 from sharpfield.storage.images import list_images
 
@@ -54,8 +54,6 @@ ORDERS = ("xytp", "txyp")
 
 NUMBERED = re.compile(r"\d{10}\.npz")
 """File names of vid2e; no other program is known to use them."""
-
-Array = Shaped[np.ndarray, "..."]
 
 
 def open_npz(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -89,7 +87,6 @@ def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recordin
     if options.unit is None and all(NUMBERED.fullmatch(file.name) for file in files):
         options = replace(options, unit="ns")
     opened = [open_npz(file, options) for file in files]
-
     log = ReadLog()
 
     def events() -> Chunks:
@@ -109,8 +106,7 @@ def open_npz_folder(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recordin
             for kind, count in file.log.counts.items():
                 pass_log.note(kind, count)
 
-    layout = "folder of npz"
-    return replace(opened[0], path=path, layout=layout, events=events, log=log)
+    return replace(opened[0], path=path, layout="folder of npz", events=events, log=log)
 
 
 def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
@@ -123,19 +119,12 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
     Raises:
         CaptureError: The file holds no events, or its unit, resolution or columns are unknown.
     """
-    array = _mapped(path)
+    array = load_array(path, mapped=True)
     unit = known_unit(options.unit) if options.unit else None
     if array.dtype.names is not None:
-        fields = _fields(array, path)
+        columns = {name: TableColumn(array, field) for name, field in _fields(array, path).items()}
         return column_recording(
-            "npy of records",
-            path,
-            lambda: EventFile(
-                path,
-                {name: TableColumn(array, field) for name, field in fields.items()},
-                unit=unit,
-                size=options.size,
-            ),
+            "npy of records", path, lambda: EventFile(path, columns, unit, options.size)
         )
     if array.ndim != 2 or array.shape[1] != len("xytp") or array.dtype.kind not in "iufb":
         raise CaptureError(
@@ -148,33 +137,10 @@ def open_npy(path: Path, options: ReaderOptions = NO_OPTIONS) -> Recording:
         raise CaptureError(
             "unknown order of columns", where=path, got=order, do='write it like "xytp" or "txyp"'
         )
+    columns = {name: TableColumn(array, order.index(name)) for name in "xytp"}
     return column_recording(
-        f"npy table {order}",
-        path,
-        lambda: EventFile(
-            path,
-            {name: TableColumn(array, order.index(name)) for name in "xytp"},
-            unit=unit,
-            size=options.size,
-        ),
+        f"npy table {order}", path, lambda: EventFile(path, columns, unit, options.size)
     )
-
-
-def _mapped(path: Path) -> Array:
-    try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError:
-        raise CaptureError("file not found", where=path) from None
-    except UNREADABLE as error:
-        pickled = "allow_pickle" in str(error) or "object" in str(error).lower()
-        raise CaptureError(
-            "file holds pickled Python objects, which may run code when loaded"
-            if pickled
-            else "not a readable npy file",
-            where=path,
-            got="" if pickled else error,
-            do="save it as plain numbers with np.save" if pickled else "copy or write it again",
-        ) from None
 
 
 def _fields(array: Array, path: Path) -> dict[str, str]:
@@ -212,7 +178,8 @@ def _order(array: Array, path: Path) -> str:
 
 def _is_possible(array: Array, order: str) -> bool:
     before = -np.inf
-    for rows in _row_chunks(array):
+    for first in range(0, len(array), CHUNK):
+        rows = np.asarray(array[first : first + CHUNK], np.float64)
         x, y, t, p = (rows[:, order.index(name)] for name in "xytp")
         if not (np.isin(p, (-1, 0, 1)).all() and np.isfinite(np.stack([x, y])).all()):
             return False
@@ -220,11 +187,6 @@ def _is_possible(array: Array, order: str) -> bool:
             return False
         before = t[-1]
     return True
-
-
-def _row_chunks(array: Array) -> Iterator[Array]:
-    for first in range(0, len(array), CHUNK):
-        yield np.asarray(array[first : first + CHUNK], np.float64)
 
 
 RECORD = 5

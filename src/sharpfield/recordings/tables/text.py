@@ -16,7 +16,6 @@ Source: Mueggler et al., *The event-camera dataset and simulator* (IJRR 2017); H
 import re
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -46,6 +45,7 @@ from sharpfield.recordings.tables.text_decode import (
     decode_lines,
 )
 from sharpfield.recordings.video import open_images
+from sharpfield.storage.arrays import UNREADABLE
 from sharpfield.storage.event_columns import UNITS, known_unit
 
 DEFAULT_COLUMNS = "txyp"
@@ -73,14 +73,8 @@ MAX_HEADER, MAX_LINE = 2**16, 2**12
 MAX_INVALID_LINES, MAX_INVALID_SHARE = 100, 0.01
 """More invalid lines than this, and than this share of all, mean that the file holds no events."""
 
-UNREADABLE = (
-    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError),
-    *(KeyError, ValueError, NotImplementedError, RuntimeError),
-)
+UNREADABLE_ZIP = (*UNREADABLE, struct.error, KeyError)
 """Errors of an archive that is damaged, encrypted or compressed in an unknown way."""
-
-Blocks = Callable[[ReadLog], Iterator[bytes]]
-"""Reads the text from the beginning; counts damage in the log."""
 
 
 @dataclass(frozen=True)
@@ -235,8 +229,11 @@ def _from(start: int, data: Iterator[bytes]) -> Iterator[bytes]:
         start = max(start - len(block), 0)
 
 
-def _zipped(path: Path) -> Blocks:
-    """Find the text of events in a zip archive, and return the function that reads it.
+def _zipped(path: Path) -> Callable[[ReadLog], Iterator[bytes]]:
+    """Find the text of events in a zip archive.
+
+    Returns:
+        Function that reads it from the beginning, and counts damage in the log.
 
     Raises:
         CaptureError: There is none or more than one, or it cannot be decompressed.
@@ -253,7 +250,7 @@ def _zipped(path: Path) -> Blocks:
                     do="name it events.txt, or unpack the archive",
                 )
             archive.open(named[0]).close()
-    except UNREADABLE as error:
+    except UNREADABLE_ZIP as error:
         raise CaptureError(
             "cannot read the archive", where=path, got=error, do="copy or pack it again"
         ) from None
@@ -263,7 +260,7 @@ def _zipped(path: Path) -> Blocks:
             with zipfile.ZipFile(path) as archive, archive.open(named[0]) as file:
                 while block := file.read(BLOCK):
                     yield block
-        except UNREADABLE:
+        except UNREADABLE_ZIP:
             pass_log.note("damaged archives, read up to the damage")
 
     return read

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sharpfield.captures.layout import ReadOptions
-from sharpfield.captures.layouts import nerf_synthetic
+from sharpfield.captures.layouts import blender
 from sharpfield.core.errors import CaptureError
 from sharpfield.storage.images import write_image
 
@@ -34,7 +34,7 @@ def changed(folder, **keys):
 
 def test_axes_camera_and_background(tmp_path):
     written(tmp_path, train=3, test=2)
-    capture = nerf_synthetic.read(tmp_path)
+    capture = blender.read(tmp_path)
     pose = capture.frame_pose(np.array([2]))[0]
     np.testing.assert_array_equal(pose, [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2]])
     assert capture.camera.fx_px == pytest.approx(8)
@@ -54,7 +54,7 @@ def test_axes_camera_and_background(tmp_path):
 )
 def test_what_is_held_out(tmp_path, sets, train, test):
     written(tmp_path, **sets)
-    split = nerf_synthetic.read(tmp_path).split
+    split = blender.read(tmp_path).split
     assert (split.train.tolist(), split.test.tolist()) == (train, test)
 
 
@@ -63,14 +63,14 @@ def test_missing_images_are_told_or_skipped(tmp_path):
     for i in (1, 3, 5, 7):
         (tmp_path / "train" / f"r_{i}.png").unlink()
     with pytest.raises(CaptureError) as told:
-        nerf_synthetic.read(tmp_path)
+        blender.read(tmp_path)
     assert str(told.value) == (
         "CaptureError: 4 of 12 images are missing\n"
         f"  where  {tmp_path}/transforms_train.json\n"
         f"  got    no r_1.png, r_3.png, r_5.png, ... in {tmp_path}/train\n"
         "  do     complete the download, or set the option `missing` to skip"
     )
-    capture = nerf_synthetic.read(tmp_path, ReadOptions(missing="skip"))
+    capture = blender.read(tmp_path, ReadOptions(missing="skip"))
     assert capture.frames.names[:3] == ("train/r_0", "train/r_2", "train/r_4")
     assert capture.trajectory.poses[:3, 2, 3].tolist() == [0, 2, 4]
 
@@ -96,27 +96,27 @@ def test_bad_files_are_refused(tmp_path, keys, message):
     written(tmp_path, train=2)
     changed(tmp_path, **keys)
     with pytest.raises(CaptureError, match=re.escape(message)):
-        nerf_synthetic.read(tmp_path)
+        blender.read(tmp_path)
 
 
 def test_what_is_no_json_is_refused(tmp_path):
     (tmp_path / "transforms_train.json").write_text("{")
     with pytest.raises(CaptureError, match="not a JSON file"):
-        nerf_synthetic.read(tmp_path)
+        blender.read(tmp_path)
 
 
 def test_a_published_scene(samples, tmp_path):
     """All cameras look at the object from a distance of 4.03; 50 of the 100 images are there."""
     lego = samples / "posed" / "nerf_synthetic_lego"
-    assert nerf_synthetic.recognise(lego)
+    assert blender.recognise(lego)
     with pytest.raises(CaptureError, match="50 of 100 images are missing"):
-        nerf_synthetic.read(lego)
+        blender.read(lego)
     # Four images suffice here: reading all of them takes seconds.
     content = json.loads((lego / "transforms_train.json").read_text())
     content["frames"] = content["frames"][:8]
     (tmp_path / "transforms_train.json").write_text(json.dumps(content))
     (tmp_path / "train").symlink_to(lego / "train")
-    capture = nerf_synthetic.read(tmp_path, ReadOptions(missing="skip"))
+    capture = blender.read(tmp_path, ReadOptions(missing="skip"))
     assert capture.frames.images.shape == (4, 800, 800, 3)
     assert capture.camera.fx_px == pytest.approx(1111.1110, abs=1e-3)
     towards = -(capture.trajectory.poses[:, :, 3] * capture.trajectory.poses[:, :, 2]).sum(-1)
