@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from sharpfield.captures.layout import ReadOptions
+from sharpfield.captures.layout import LayoutName, ReadOptions
 from sharpfield.captures.read import read_capture
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
@@ -22,7 +22,7 @@ from sharpfield.recordings.open import open_recording as open_any
 from sharpfield.recordings.recording import ReaderOptions, Recording
 from sharpfield.runs.config import OWN_CAPTURE, STREAMS, RunConfig, device_named
 from sharpfield.runs.run import Run, open_run
-from sharpfield.runs.start import LayoutName, expect_capture, train_run, write
+from sharpfield.runs.start import expect_capture, train_run, write
 from sharpfield.simulation.by_name import (
     RecordingOptions,
     RigOptions,

@@ -84,7 +84,7 @@ def test_no_log_no_curves(tmp_path: Path):
 def test_heavy_libraries_are_imported_when_they_are_used():
     program = (
         "import sys; from sharpfield.evaluation import report; from sharpfield.preparation import"
-        " quality; from sharpfield.preparation.doctor import page;"
+        " quality; from sharpfield.preparation.doctor import checkup;"
         " print(sorted({'matplotlib', 'av', 'jinja2'} & set(sys.modules)))"
     )
     words, source = [sys.executable, "-c", program], Path(__file__).parents[2] / "src"

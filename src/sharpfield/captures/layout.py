@@ -70,3 +70,6 @@ class Layout:
     """The files by which it is recognised, in words."""
     options: tuple[str, ...] = ()
     """Options that `read` takes besides those for every layout."""
+
+
+LayoutName = Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"]

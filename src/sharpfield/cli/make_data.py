@@ -9,8 +9,8 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from sharpfield.captures.layout import LayoutName
 from sharpfield.cli.arguments import Device, Size, parse_size, screen
-from sharpfield.runs.start import LayoutName
 from sharpfield.simulation.by_name import (
     RECORDING,
     RIG,

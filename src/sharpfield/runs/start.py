@@ -5,7 +5,7 @@ Captures written to disk in the layouts that other programs read.
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -84,7 +84,6 @@ def train_run(
 if TYPE_CHECKING:  # names of layouts are read without importing torch
     from sharpfield.core.capture import Capture
 
-LayoutName = Literal["native", "ev-deblur-nerf", "evdnerf", "scannet"]
 WRITERS: dict[str, str] = {
     "native": "native.layout",
     "ev-deblur-nerf": "writers.llff_events",

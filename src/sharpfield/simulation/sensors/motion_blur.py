@@ -10,7 +10,6 @@ blur, with k drawn from 3...16 and phi from 0...0.1, for 75 % of the training fr
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8, UInt16
 
@@ -81,6 +80,8 @@ def drawn_blur(ranges: KernelRange, draw: np.random.Generator) -> DrawnBlur | No
 
 def motion_kernel(k: int, phi: float, draw: np.random.Generator) -> Float32[np.ndarray, "k k"]:
     """A random kernel of size k and intensity phi; it sums to 1."""
+    import cv2
+
     diagonal = 2 * np.sqrt(2) * k
     steps = _steps(phi, diagonal, draw)
     way = np.cumsum(steps * np.exp(1j * _headings(len(steps), phi, draw)))
@@ -104,6 +105,8 @@ def blurred(
 
     The border is replicated; published data darken there.
     """
+    import cv2
+
     turned = cv2.flip(kernel, -1)  # OpenCV correlates
     anchor = (len(kernel) // 2,) * 2
     mixed = cv2.filter2D(
