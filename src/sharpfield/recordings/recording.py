@@ -166,8 +166,9 @@ class ReaderOptions:
     """The file with the image times, where there are several candidates."""
 
     def given(self) -> dict[str, Any]:
-        """The options that were given, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
+        """The options that were given, by name; those of a subclass are not among them."""
+        values = {name: getattr(self, name) for name in ReaderOptions.__dataclass_fields__}
+        return {name: value for name, value in values.items() if value is not None}
 
     def only(self, names: Collection[str]) -> "ReaderOptions":
         """These options without all others."""
