@@ -86,15 +86,15 @@ class Struct:
         return self.shape[0]
 
     @classmethod
-    def cat(cls: type[S], items: Sequence[S]) -> S:
-        """Join structs along the first leading axis. A field is None in all of them or in none."""
+    def cat(cls: type[S], items: Sequence[S], axis: int = 0) -> S:
+        """Join structs along a leading axis. A field is None in all of them or in none."""
         joined: dict[str, Any] = {}
         for field in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
             values = [getattr(item, field.name) for item in items]
             if isinstance(values[0], Tensor):
-                joined[field.name] = torch.cat(values)
+                joined[field.name] = torch.cat(values, axis)
             elif isinstance(values[0], Struct):
-                joined[field.name] = type(values[0]).cat(values)
+                joined[field.name] = type(values[0]).cat(values, axis)
         return dataclasses.replace(items[0], **joined)  # pyright: ignore
 
     def _fields(self) -> list[tuple[str, Any]]:

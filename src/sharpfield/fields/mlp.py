@@ -106,11 +106,3 @@ class MLPField(nn.Module):
     ) -> Float[Tensor, "*b t 0"]:
         """Nothing."""
         return torch.cat([old, new], -2)[..., :0]
-
-    def planes(self) -> list[nn.Parameter]:
-        """None."""
-        return []
-
-    def lines(self) -> list[nn.Parameter]:
-        """None."""
-        return []

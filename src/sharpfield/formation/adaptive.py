@@ -67,7 +67,7 @@ class AdaptiveWeights(nn.Module):
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        self.integration = integration
+        self.integration: Integration = integration
         self.embed = Dense([features] + 4 * [EMBEDDED], generator=generator)
         self.localise = Dense([EMBEDDED, LOCAL], generator=generator)
         self.attend = Dense([LOCAL, 1], generator=generator, bias=False)
@@ -113,8 +113,7 @@ class AdaptiveWeights(nn.Module):
         self, features: Float[Tensor, "b k s f"], gap: Float[Tensor, "b k s"]
     ) -> tuple[Float[Tensor, "b k e"], Float[Tensor, "b k l"], Float[Tensor, "b s l"]]:
         embedded = self.embed(features).relu()  # [b, k, s, 64]
-        gather = gather_along_samples if self.integration == "samples" else gather_along_channels
-        ray = gather(embedded.to(gap.dtype), gap)
+        ray = _integrated(embedded.to(gap.dtype), gap, self.integration)
         local = self.localise(embedded)  # [b, k, s, 32]
         attention = self.attend(local).to(gap.dtype)  # [b, k, s, 1]
         inter = (attention.softmax(2) * local).sum(2)
@@ -165,19 +164,17 @@ def _look_up(
     return (query @ key.transpose(1, 2)).softmax(-1) @ value(key)
 
 
-def gather_along_samples(
-    density: Float[Tensor, "b k s e"], gap: Float[Tensor, "b k s"]
+def _integrated(
+    density: Float[Tensor, "b k s e"], gap: Float[Tensor, "b k s"], integration: Integration
 ) -> Float[Tensor, "b k e"]:
-    """Volume rendering of each channel with itself as density: sum_s T_s (1 - e^(-h_s d_s)) h_s."""
-    thick = density * gap[..., None]
-    before = thick.cumsum(2) - thick
-    return ((-before).exp() * -torch.expm1(-thick) * density).sum(2)
+    """Volume rendering of each channel with itself as density: sum_s T_s (1 - e^(-h_s d_s)) h_s.
 
-
-def gather_along_channels(
-    density: Float[Tensor, "b k s e"], gap: Float[Tensor, "b k s"]
-) -> Float[Tensor, "b k e"]:
-    """The same with the released transmittance: along the previous sample's channels, up to e."""
+    With `channels` T_s is the released transmittance: along the previous sample's channels, up to
+    e.
+    """
     thick = density * gap[..., None]
-    before = nn.functional.pad(thick[:, :, :-1].cumsum(3), (0, 0, 1, 0))
+    if integration == "samples":
+        before = thick.cumsum(2) - thick
+    else:
+        before = nn.functional.pad(thick[:, :, :-1].cumsum(3), (0, 0, 1, 0))
     return ((-before).exp() * -torch.expm1(-thick) * density).sum(2)

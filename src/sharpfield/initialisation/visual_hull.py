@@ -24,6 +24,7 @@ from jaxtyping import Bool, Float, Int32, Int64
 from torch import Tensor
 from torch.nn import functional
 
+from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Tone
@@ -210,8 +211,14 @@ def _project(
     capture: Capture, track: int, points: Float[Tensor, "n 3"]
 ) -> tuple[Bool[Tensor, "n"], Int64[Tensor, "n"], Float[Tensor, "n"]]:
     """Whether a static camera sees points, in which pixels (row by row), and at which depth."""
-    camera = capture.camera
     pose = capture.trajectory.pose(torch.zeros(()), torch.tensor(track)).detach().float()
+    return _pixels_of(capture.camera, pose, points)
+
+
+def _pixels_of(
+    camera: Camera, pose: Float[Tensor, "3 4"], points: Float[Tensor, "n 3"]
+) -> tuple[Bool[Tensor, "n"], Int64[Tensor, "n"], Float[Tensor, "n"]]:
+    """The same of a camera with a given pose."""
     local = (points - pose[:, 3]) @ pose[:, :3]
     depth = local[:, 2]
     column, row = camera.project(local).nan_to_num(-1.0).floor().long().unbind(-1)
@@ -293,11 +300,8 @@ def _colours(
         own = train[frames.track[train] == track]
         frame = int(own[np.abs(frames.exposure.middle_us[own] - at).argmin()])
         pose = capture.frame_pose(np.array([frame]))[0].detach().float()
-        local = (points - pose[:, 3]) @ pose[:, :3]
-        column, row = capture.camera.project(local).nan_to_num(-1.0).floor().long().unbind(-1)
-        inside = (local[:, 2] > 0) & (column >= 0) & (column < capture.camera.width)
-        inside &= (row >= 0) & (row < capture.camera.height)
+        inside, pixel, _ = _pixels_of(capture.camera, pose, points)
         image = torch.from_numpy(frames.images[frame].astype(np.float32)) / frames.white
-        total[inside] += image[row[inside], column[inside]]
+        total[inside] += image.flatten(0, 1)[pixel[inside]]
         count += inside
     return total / count.clamp_min(1)[:, None]

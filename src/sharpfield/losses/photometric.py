@@ -1,7 +1,7 @@
 """How far predicted images and depths are from measured ones."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sharpfield.core.frames import LEAST_DEPTH
@@ -17,6 +17,17 @@ def mse(predicted: Float[Tensor, "*b c"], measured: Float[Tensor, "*b c"]) -> Fl
         measured: As stored, usually 0...1; targets may exceed 1.
     """
     return (predicted - measured).square().mean()
+
+
+def weighted_mse(
+    predicted: Float[Tensor, "b c"],
+    measured: Float[Tensor, "b c"],
+    weight: Float[Tensor, "b"],
+    counted: Bool[Tensor, "b"],
+) -> Float[Tensor, ""]:
+    """Mean over the pixels that count of their squared difference, times a weight of each."""
+    error = (predicted - measured).square().mean(-1) * weight * counted
+    return error.sum() / counted.sum().clamp_min(1)
 
 
 def l1(predicted: Float[Tensor, "*b c"], measured: Float[Tensor, "*b c"]) -> Float[Tensor, ""]:

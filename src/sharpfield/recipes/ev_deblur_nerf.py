@@ -119,18 +119,8 @@ def standard(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
 
 def published(recipe: "EvDeblurNeRF") -> "EvDeblurNeRF":
     """The published size and length."""
-    whole = VolumeOptions()
-    volume = replace(
-        recipe.volume,
-        voxels=whole.voxels,
-        channels=whole.channels,
-        coarse=whole.coarse,
-        fine=whole.fine,
-        octaves=whole.octaves,
-        samples=whole.samples,
-        precision="auto",
-    )
-    return replace(recipe.lasting(30_000), lr=5e-3, volume=volume)
+    sizes = {name: getattr(VolumeOptions(), name) for name in STANDARD} | {"precision": "auto"}
+    return replace(recipe.lasting(30_000), lr=5e-3, volume=replace(recipe.volume, **sizes))
 
 
 def variant_for(capture: Capture, size: str) -> str:
@@ -301,17 +291,15 @@ class Model(nn.Module):
         prior, until = recipe.prior, recipe.prior.until
         weight = cosine(prior.weight, prior.final_weight, begin=0, until=until)
         known = self.capture.known.motion != "unknown"
-        sharpened = self.events is not None and prior.weight > 0 and known
+        guess = (
+            self.events.guess if self.events is not None and prior.weight > 0 and known else None
+        )
         if recipe.frames.blur == "motion" or (recipe.frames.blur == "auto" and known):
             targets = None
-            if sharpened and self.events is not None:
-                targets = InstantsPrior(
-                    self.capture, self.events.guess, instants=recipe.frames.instants
-                )
+            if guess is not None:
+                targets = InstantsPrior(self.capture, guess, instants=recipe.frames.instants)
             return MotionTerm(recipe.frames, volume, self.tone.encode, weight, prior=targets)
-        middle = None
-        if sharpened and self.events is not None:
-            middle = MiddlePrior(prior, self.capture, self.events.guess)
+        middle = None if guess is None else MiddlePrior(prior, self.capture, guess)
         blur = None
         if recipe.frames.blur != "none":
             blur = LearnedBlur(

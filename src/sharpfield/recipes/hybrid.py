@@ -32,20 +32,6 @@ from sharpfield.recipes.points.scene import PointScene
 from sharpfield.recipes.settings.papers import paper_of
 from sharpfield.recipes.settings.presets import Presets
 
-RENAMED = {
-    **point_nerf.RENAMED,
-    "sources.choose": "sources.selection",
-    "sources.fetch": "sources.interpolation",
-    "sources.slack": "sources.depth_tolerance",
-    "sources.drop": "sources.dropout",
-    "sources.trust": "sources.quality_power",
-    "sources.prefer": "sources.selection_quality_power",
-    "quality": "frame_quality",
-    "merge": "merge_width",
-    "released": "checkpoint",
-}
-"""Old names of options."""
-
 
 @dataclass(frozen=True)
 class BlurOptions:
@@ -123,7 +109,18 @@ class Hybrid(PointNeRF):
     """Neural points with features of nearby images, from blurry video with depth."""
 
     paper: ClassVar[Paper] = paper_of("hybrid")
-    renamed: ClassVar[dict[str, str]] = RENAMED
+    renamed: ClassVar[dict[str, str]] = {
+        **PointNeRF.renamed,
+        "sources.choose": "sources.selection",
+        "sources.fetch": "sources.interpolation",
+        "sources.slack": "sources.depth_tolerance",
+        "sources.drop": "sources.dropout",
+        "sources.trust": "sources.quality_power",
+        "sources.prefer": "sources.selection_quality_power",
+        "quality": "frame_quality",
+        "merge": "merge_width",
+        "released": "checkpoint",
+    }
     presets: ClassVar[Presets] = Presets(
         variants={"h-only": h_only, "rooms": rooms, "learned": learned, "no-images": no_images},
         sizes={"draft": draft, "standard": standard, "paper": point_nerf.published},

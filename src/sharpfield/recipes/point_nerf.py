@@ -19,47 +19,24 @@ from sharpfield.recipes.settings.presets import Presets
 R = TypeVar("R", bound="PointNeRF")
 
 
-RENAMED = {
-    "cloud.budget": "cloud.max_points",
-    "cloud.nearest": "cloud.min_depth",
-    "cloud.farthest": "cloud.max_depth",
-    "rate": "lr",
-    "points_rate": "points_lr",
-    "decay": "lr_final",
-    "decisive": "confidence_weight",
-    "start_colours": "residual_colours",
-    "drawn.side": "sampling.patch_size",
-    "drawn.apart": "sampling.spacing",
-    "drawn": "sampling",
-    "march.asked": "march.max_samples",
-    "growth.share": "growth.frame_share",
-    "growth.opaque": "growth.min_opacity",
-    "growth.drop": "growth.prune_below",
-    "growth.most": "growth.max_points",
-}
-"""Old names of options."""
-
-P = TypeVar("P", bound="PointNeRF")
-
-
-def draft(recipe: P) -> P:
+def draft(recipe: R) -> R:
     """Minutes on two CPU cores: small networks on averaged neighbours, residual colours."""
     recipe = quick(recipe, points=50_000, width=64, feature=64, pixels=1024, samples=12)
     return replace(recipe.lasting(2000), lr=2e-3, points_lr=5e-3, lr_final=0.05)
 
 
-def standard(recipe: P) -> P:
+def standard(recipe: R) -> R:
     """Minutes on a GPU, hours on a CPU."""
     recipe = quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, samples=16)
     return replace(recipe.lasting(20_000), lr=1e-3, points_lr=4e-3, lr_final=0.05)
 
 
-def published(recipe: P) -> P:
+def published(recipe: R) -> R:
     """The published networks, points and length."""
     return recipe
 
 
-def quick(recipe: P, *, points: int, width: int, feature: int, pixels: int, samples: int) -> P:
+def quick(recipe: R, *, points: int, width: int, feature: int, pixels: int, samples: int) -> R:
     """Settings that learn fast without weights pre-trained on another data set."""
     patch_pixels = recipe.sampling.patch_size**2
     sampling = PatchSamplingOptions(
@@ -99,7 +76,24 @@ class PointNeRF:
     """Neural points from depth; frames are taken as sharp. The baseline of `hybrid`."""
 
     paper: ClassVar[Paper] = paper_of("point-nerf")
-    renamed: ClassVar[dict[str, str]] = RENAMED
+    renamed: ClassVar[dict[str, str]] = {
+        "cloud.budget": "cloud.max_points",
+        "cloud.nearest": "cloud.min_depth",
+        "cloud.farthest": "cloud.max_depth",
+        "rate": "lr",
+        "points_rate": "points_lr",
+        "decay": "lr_final",
+        "decisive": "confidence_weight",
+        "start_colours": "residual_colours",
+        "drawn.side": "sampling.patch_size",
+        "drawn.apart": "sampling.spacing",
+        "drawn": "sampling",
+        "march.asked": "march.max_samples",
+        "growth.share": "growth.frame_share",
+        "growth.opaque": "growth.min_opacity",
+        "growth.drop": "growth.prune_below",
+        "growth.most": "growth.max_points",
+    }
     presets: ClassVar[Presets] = Presets(
         sizes={"draft": draft, "standard": standard, "paper": published}
     )

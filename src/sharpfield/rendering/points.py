@@ -20,12 +20,7 @@ from torch import Generator, Tensor
 from sharpfield.core.rays import Rays
 from sharpfield.core.struct import Struct
 from sharpfield.ops import compositing
-
-MIN_WEIGHT_EVAL = 1e-4
-"""In evaluation, colour is not computed for samples of a smaller weight."""
-
-MIN_WEIGHT_TRAIN = 1e-7
-"""The same in training, where it must not affect any gradient."""
+from sharpfield.rendering.coarse_to_fine import MIN_WEIGHT_EVAL, MIN_WEIGHT_TRAIN
 
 UNEVEN = 0.3
 """In training, the length of steps varies by up to this fraction."""

@@ -92,7 +92,8 @@ def flattened(camera: Camera) -> Flat:
             do="crop the recording to 75 degrees, or use a recipe that renders rays",
         )
     low, high = plane.amin((0, 1)), plane.amax((0, 1))
-    focal = _finest(plane)
+    steps = [plane[:, 1:] - plane[:, :-1], plane[1:] - plane[:-1]]
+    focal = max(1 / float(step.norm(dim=-1).min()) for step in steps)  # where pixels are densest
     pixels = float((high - low).prod()) * focal**2
     focal = focal * min(1.0, MOST_PIXELS * camera.width * camera.height / pixels) ** 0.5
     # Pixels of the two images coincide on the axis, where most lenses have next to no distortion.
@@ -118,12 +119,6 @@ def resampled(drawn: Drawn, where: Float[Tensor, "v h w 2"]) -> Drawn:
         flat.movedim(-1, 1), 2 * where / span - 1, padding_mode="border", align_corners=False
     ).movedim(1, -1)
     return Drawn(seen[..., :-2], seen[..., -2], seen[..., -1])
-
-
-def _finest(plane: Float[Tensor, "h w 2"]) -> float:
-    """Pixels per unit of the plane z = 1, where they are densest."""
-    steps = [plane[:, 1:] - plane[:, :-1], plane[1:] - plane[:-1]]
-    return max(1 / float(step.norm(dim=-1).min()) for step in steps)
 
 
 ROUNDS = 2

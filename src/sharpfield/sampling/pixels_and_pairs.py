@@ -7,8 +7,6 @@ steps, so the batch of step 700 does not depend on how step 700 was reached.
 
 Images and events stay as they are stored (and may be memory-mapped); only the batch is converted.
 
-Small patches of frames, drawn as pure functions of the seed and the step.
-
 A *patch* is p by p pixels with a spacing of `apart` pixels: with a wide spacing, a kernel of few
 pixels on the patch represents a long blur in the image. Patches of one pixel are pixels.
 
@@ -110,7 +108,15 @@ def draw_pixels(
     drawn = _drawn(len(table), count, seed=seed, step=step, stream="pixels")
     height, width = table.images.shape[1:3]
     which, pixel = np.divmod(drawn, height * width)
-    frame, (row, column) = table.frame[which], np.divmod(pixel, width)
+    return _pixels(table, table.frame[which], *np.divmod(pixel, width)).to(device)
+
+
+def _pixels(
+    table: PixelTable,
+    frame: Int64[np.ndarray, "*b"],
+    row: Int64[np.ndarray, "*b"],
+    column: Int64[np.ndarray, "*b"],
+) -> Pixels:
     open_close = torch.from_numpy(table.time[frame])
     value = table.images[frame, row, column].astype(np.float32) / np.float32(table.white)
     xy = np.stack([column, row], -1).astype(np.float32) + np.float32(PIXEL_CENTRE)
@@ -118,10 +124,10 @@ def draw_pixels(
         xy=torch.from_numpy(xy),
         frame=torch.from_numpy(frame),
         track=torch.from_numpy(table.track[frame]),
-        open=open_close[:, 0],
-        close=open_close[:, 1],
+        open=open_close[..., 0],
+        close=open_close[..., 1],
         value=torch.from_numpy(value),
-    ).to(device)
+    )
 
 
 def pair_table(
@@ -342,15 +348,5 @@ def draw_patches(
     offset = np.arange(shape.side) * step_px[:, None]  # [count, side]
     row = np.broadcast_to((top[:, None] + offset)[:, :, None], (count, shape.side, shape.side))
     column = np.broadcast_to((left[:, None] + offset)[:, None], row.shape)
-    which = np.broadcast_to(frame[:, None, None], row.shape)
-    value = table.images[which, row, column].astype(np.float32) / np.float32(table.white)
-    xy = np.stack([column, row], -1).astype(np.float32) + np.float32(PIXEL_CENTRE)
-    open_close = torch.from_numpy(table.time[which])
-    return Pixels(
-        xy=torch.from_numpy(xy),
-        frame=torch.from_numpy(which.copy()),
-        track=torch.from_numpy(table.track[which]),
-        open=open_close[..., 0],
-        close=open_close[..., 1],
-        value=torch.from_numpy(value),
-    )
+    which = np.broadcast_to(frame[:, None, None], row.shape).copy()
+    return _pixels(table, which, row, column)

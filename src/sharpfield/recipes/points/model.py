@@ -25,6 +25,7 @@ from sharpfield.core.tone import tone_of
 from sharpfield.fields.neural_points import ColourHead
 from sharpfield.formation.patch_kernel import ChosenKernel, LearnedKernel
 from sharpfield.formation.shutter import Pinhole
+from sharpfield.losses.photometric import weighted_mse
 from sharpfield.losses.regularizers import indecision
 from sharpfield.recipes.points.images import ImageBranch, Prepared
 from sharpfield.recipes.points.scene import PointScene, grown, missing_points
@@ -130,9 +131,8 @@ class PointModel(nn.Module):
         colour = met.colour
         if self.blur is not None:
             colour = self._blurred(colour, seen, met)
-        error = (colour - flat.value).square().mean(-1) * self.weight[flat.frame] * met.hit
-        terms = {"frames": error.sum() / met.hit.sum().clamp_min(1)}
-        return terms | self._decided(met)
+        error = weighted_mse(colour, flat.value, self.weight[flat.frame], met.hit)
+        return {"frames": error} | self._decided(met)
 
     def colour(self, asked: ShadedSamples, ready: Prepared | None) -> Float[Tensor, "n c"]:
         """Colour of samples on rays, as frames store it."""

@@ -1,9 +1,7 @@
-"""The sharp scene of the recipes on neural points: a cloud from depth, its networks, and rays.
-
-Growing and pruning of neural points.
+"""The sharp scene of the recipes on neural points: a cloud from depth, its networks, and growth.
 
 A ray *misses* if no point is near it although its pixel differs from the background. Where a ray
-beside such a pixel has a single opaque sample, a point is added found, with the mean descriptor of
+beside such a pixel has a single opaque sample, a point is added there, with the mean descriptor of
 its neighbours. So surfaces grow at their edges, round after round.
 
 Source: Point-NeRF (CVPR 2022), section 4.3; numbers from the released code of Hybrid Neural
@@ -230,7 +228,11 @@ def missing_points(
     count = max(round(options.frame_share * len(train)), 1)
     random = numpy_generator(scene.seed, step, "growth")
     drawn = random.permutation(train)[: CANDIDATES * count]
-    missed = [_missed(scene, pinhole, int(frame)) for frame in drawn]
+    missed: list[float] = []  # squared error of the background where rays miss, on a coarse grid
+    for frame in drawn:
+        stored, hit, *_ = _rendered(scene, pinhole, int(frame), STRIDE)
+        error = (stored - scene.march.background).square().mean(-1)
+        missed.append(float((error * ~hit).sum()))
     worst = drawn[np.argsort(missed, kind="stable")[::-1][:count]]
     positions = [_edge(options, scene, pinhole, int(frame)) for frame in worst]
     position = torch.cat(positions)
@@ -272,13 +274,6 @@ def grown(
     source = torch.cat([stay, rows[:, 0]])
     fresh = torch.arange(len(source), device=source.device) >= len(stay)
     return Growth(source, fresh, values)
-
-
-def _missed(scene: PointScene, pinhole: Pinhole, frame: int) -> float:
-    """Squared error of the background where rays miss, summed over a coarse grid."""
-    stored, hit = _rendered(scene, pinhole, frame, STRIDE)[:2]
-    error = (stored - scene.march.background).square().mean(-1)
-    return float((error * ~hit).sum())
 
 
 def _edge(

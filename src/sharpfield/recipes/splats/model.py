@@ -77,7 +77,8 @@ class SplatModel(nn.Module):
         self.steps, self.seed, self.sampling = steps, seed, sampling
         # A hull of what moves needs a box around the scene; a static one keeps its near depth.
         self.capture, self.change = normalised(capture) if motion is None else recentred(capture)
-        if _motion_unknown(capture) and sampling.blur == "motion":
+        unknown = capture.known.motion == "unknown" and capture.frames is not None
+        if unknown and sampling.blur == "motion":
             self.capture = with_learned_exposure_motion(self.capture, seed)
         else:
             self.capture = with_learned_poses(self.capture, calibration)
@@ -274,10 +275,6 @@ def align_events_to_rolling_shutter(capture: Capture) -> Capture:
     if frames is None or events is None:
         return capture
     return replace(capture, events=subtract_row_delay(events, frames.exposure.row_delay_us))
-
-
-def _motion_unknown(capture: Capture) -> bool:
-    return capture.known.motion == "unknown" and capture.frames is not None
 
 
 def merge_blocks(models: Sequence[object], blocks: Sequence[Block]) -> SplatModel:

@@ -212,7 +212,8 @@ class SplatScene(nn.Module):
             light = self._render(self.static, views, how, step)
         else:
             columns = [views[:, j : j + 1] for j in range(views.shape[1])]
-            light = _side_by_side([self._render_moving(self.moving, v, how, step) for v in columns])
+            parts = [self._render_moving(self.moving, v, how, step) for v in columns]
+            light = Radiance.cat(parts, axis=3)  # [m, h, w, k]
         if self.background is None:
             return light
         behind = self.tone.decode(self.background.clamp(0, 1))
@@ -359,13 +360,3 @@ def _path_groups(
 def _from(begin: int, rate: Schedule) -> Schedule:
     """A learning rate, and 0 before a step."""
     return lambda step: rate(step) if step >= begin else 0.0
-
-
-def _side_by_side(columns: Sequence[Radiance]) -> Radiance:
-    """Views `[m, h, w, 1]` of several instants, joined along the axis of instants."""
-    return Radiance(
-        torch.cat([column.rgb for column in columns], -2),
-        torch.cat([column.depth for column in columns], -1),
-        torch.cat([column.opacity for column in columns], -1),
-        torch.cat([column.weight for column in columns], -1),
-    )

@@ -96,13 +96,10 @@ class LearnedBlur(nn.Module):
         if self.adaptive is None:
             share = 0.0
         if rigid:
-            terms["blur"] = (1 - share) * self._error(light, seen)
+            errors = [mse(self.kernel.observe(stage, seen), seen.value) for stage in stages(light)]
+            terms["blur"] = (1 - share) * torch.stack(errors).sum()
         if self.adaptive is not None and light.samples is not None:
             weight = self.adaptive(light.samples, self.motions.codes(seen.frame))
             mixed = Radiance(light.rgb, light.depth, light.opacity, weight)
             terms["adaptive"] = share * mse(self.kernel.observe(mixed, seen), seen.value)
         return terms
-
-    def _error(self, light: Radiance, seen: Pixels) -> Float[Tensor, ""]:
-        errors = [mse(self.kernel.observe(stage, seen), seen.value) for stage in stages(light)]
-        return torch.stack(errors).sum()

@@ -1,12 +1,9 @@
-"""The scene of D-NeRF: a canonical radiance field and a deformation field.
+"""Dynamic scenes of the volume recipes: deformed, or on voxels that change with time.
 
-A. Pumarola et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021, as EvDNeRF (WACV
-2024) uses it.
-
-A dynamic scene on voxels: a centred capture, static and moving voxel grids, a renderer.
-
-Regularisers settle what events leave open: moving voxels are smooth in space and in time, and empty
-space is transparent.
+The deformed one is that of D-NeRF, a canonical radiance field and a deformation field: A. Pumarola
+et al., *D-NeRF: Neural Radiance Fields for Dynamic Scenes*, CVPR 2021, as EvDNeRF (WACV 2024) uses
+it. On voxels, regularisers settle what events leave open: moving voxels are smooth in space and in
+time, and empty space is transparent.
 """
 
 from collections.abc import Callable
@@ -110,33 +107,11 @@ class WarpedScene(nn.Module):
         for k in range(rays.shape[1]):
             made.set_state(start)
             parts.append(self.view(rays[:, k : k + 1], made))
-        return joined(parts)
+        return Radiance.cat(parts, axis=1)  # [b, k]
 
     def groups(self, rate: Schedule) -> list[Group]:
         """Parameters of all networks with their learning rate."""
         return [Group("networks", tuple(self.parameters()), rate)]
-
-
-def joined(parts: list[Radiance]) -> Radiance:
-    """Radiances `[b, 1]` side by side, `[b, k]`."""
-
-    def along(seen: list[Radiance]) -> Radiance:
-        return Radiance(
-            torch.cat([one.rgb for one in seen], 1),
-            torch.cat([one.depth for one in seen], 1),
-            torch.cat([one.opacity for one in seen], 1),
-            torch.cat([one.weight for one in seen], 1),
-        )
-
-    coarse = [one.coarse for one in parts if one.coarse is not None]
-    whole = along(parts)
-    return Radiance(
-        whole.rgb,
-        whole.depth,
-        whole.opacity,
-        whole.weight,
-        coarse=along(coarse) if coarse else None,
-    )
 
 
 PENALTY_POINTS = 2048

@@ -140,14 +140,16 @@ class Volume(nn.Module):
         if isinstance(self.field, VoxelField):
             # Plenoxels (CVPR 2022) takes the root of the squares instead, at sampled cells.
             return total_variation(self.field.static[0])
-        planes, lines = self.field.planes(), self.field.lines()
-        return smoothness(planes, lines) if planes else torch.zeros((), device=self.device)
+        if isinstance(self.field, PlaneField):
+            return smoothness(self.field.planes(), self.field.lines())
+        return torch.zeros((), device=self.device)
 
     def groups(self, rate: Schedule, grids_rate: Schedule) -> list[Group]:
         """Parameters of networks and grids with their learning rates."""
+        grids: tuple[nn.Parameter, ...] = ()
         if isinstance(self.field, VoxelField):
-            grids: tuple[nn.Parameter, ...] = tuple(self.field.static)
-        else:
+            grids = tuple(self.field.static)
+        elif isinstance(self.field, PlaneField):
             grids = (*self.field.planes(), *self.field.lines())
         known = {id(grid) for grid in grids}
         networks = [p for p in self.field.parameters() if id(p) not in known]

@@ -1,8 +1,8 @@
-"""The frame terms of the volume recipes: learned blur kernels, or blur along the known motion.
+"""Terms of the volume recipes: of frames, of the EDI prior, and of pairs of events.
 
-The EDI prior: sharp images from the event double integral as targets of single rays.
-
-The event term of the volume recipes: pairs of events, responses, and the contrast error.
+Frames are blurred by a learned kernel, or along the known motion. The EDI prior has sharp images
+from the event double integral as targets of single rays. Events have a response and the contrast
+error.
 """
 
 from dataclasses import dataclass, replace
@@ -333,7 +333,7 @@ class EventTerm(nn.Module):
             accumulate=self.options.accumulate,
             device=device,
         )
-        return seen if self.coloured else _mono(seen)
+        return seen if self.coloured else replace(seen, channel=None)
 
     def sensor(self, step: int) -> LogContrast:
         """The event sensor with the response of a step."""
@@ -364,8 +364,3 @@ class EventTerm(nn.Module):
     def groups(self, rate: Schedule) -> list[Group]:
         """Parameters of response and thresholds with their learning rate."""
         return [Group("response", own, rate)] if (own := tuple(self.parameters())) else []
-
-
-def _mono(seen: EventPairs) -> EventPairs:
-    """The same pairs without colour channels."""
-    return replace(seen, channel=None)
