@@ -90,3 +90,6 @@ class Depths(Struct):
 
 Batch = dict[str, Pixels | EventPairs | Instants | Depths]
 """What a recipe draws for a step, by name."""
+
+Terms = dict[str, Tensor]
+"""The terms of a loss, by name."""

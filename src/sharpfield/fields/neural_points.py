@@ -1,21 +1,14 @@
-"""Networks of a neural point field: density, feature and colour from the points around a position.
-
-Two small networks process each neighbour: the first reads its descriptor and the offset to it, the
-second also its colour and the direction from which it was seen. Their outputs are averaged with
-weights by inverse distance and confidence; a third network adds the viewing direction and gives the
-*feature*, from which one layer computes the colour.
-
-Source: Point-NeRF (CVPR 2022), section 4; sizes and order of inputs from the released code of
-Hybrid Neural Rendering (CVPR 2023).
-
-Neural points: a point cloud with learned attributes.
+"""A neural point field: density, feature and colour from the learned points around a position.
 
 A *neural point* has a fixed position and learned *attributes*: a *descriptor*, which is the input
 of networks, a *confidence* that it is on a surface, a colour, and the direction from which it was
-first seen. Colours are stored values, not light.
+first seen. Colours are stored values, not light. Two small networks process each neighbour: the
+first reads its descriptor and the offset to it, the second also its colour and first direction.
+Their outputs are averaged with weights by inverse distance and confidence; a third network adds the
+viewing direction and gives the *feature*, from which one layer computes the colour.
 
-Source: Point-NeRF (CVPR 2022), section 3; attributes as in the released code of Hybrid Neural
-Rendering (CVPR 2023).
+Source: Point-NeRF (CVPR 2022), sections 3 and 4; attributes, sizes and order of inputs from the
+released code of Hybrid Neural Rendering (CVPR 2023).
 """
 
 from collections.abc import Mapping

@@ -1,11 +1,9 @@
 """Where static Gaussians start, from whatever a capture has.
 
-Measured depth gives points on surfaces. Otherwise points are triangulated from sharp images, or
-placed around a known sparse cloud: of a static scene the images are the frames, deblurred with
-events; of a moving one they are the *backdrop*, what each camera sees most of the time. Without
-frames, points fill what the cameras see, in grey.
-
-Points to start from on the surfaces that a depth camera measured.
+Depth that a camera measured gives points on surfaces. Otherwise points are triangulated from sharp
+images, or placed around a known sparse cloud: of a static scene the images are the frames,
+deblurred with events; of a moving one they are the *backdrop*, what each camera sees most of the
+time. Without frames, points fill what the cameras see, in grey.
 """
 
 import numpy as np

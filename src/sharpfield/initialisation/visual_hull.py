@@ -10,9 +10,9 @@ that of the static scene. Wherever it is further from it than what is left over 
 it sees something else. *Activity* works for windows of time, and with frames: where there are
 events, or where a frame differs from the median of its camera's frames.
 
-Source: visual hulls, Laurentini (PAMI 1994), with silhouettes from events.
+Moving Gaussians start there: they fill the visual hull of what moves, at all times.
 
-Where moving Gaussians start: they fill the visual hull of what moves, at all times.
+Source: visual hulls, Laurentini (PAMI 1994), with silhouettes from events.
 """
 
 import math

@@ -2,15 +2,11 @@
 
 Everything is in natural log: `predicted` is the change that a scene makes (`formation.events`),
 `measured` the signed counts of events times their contrast thresholds (`EventPairs.measured`), from
-event to event or in windows of time.
+event to event or in windows of time. Errors of whole views are in units of events, as their number
+is what was measured, and what is rounded; their windows go from one instant of a batch to the next.
 
 Source: EvDNeRF (WACV 2024) for the normalised error and the dead zone; Robust e-NeRF (ICCV 2023)
 for errors in units of the threshold.
-
-How far the change of log light of whole views is from the events counted in windows.
-
-A *window* is the time from one instant of a batch to the next. Errors are in units of events, as
-their number is what was measured, and what is rounded.
 """
 
 from dataclasses import replace

@@ -1,13 +1,11 @@
-"""Small MLPs: with skips, with a split first layer, with leaky ReLU; a learned vector per frame.
+"""Small MLPs, a learned vector per frame, and rows of a large table with a sparse gradient.
 
 All initial parameters come from an explicit generator. `linear` and `Dense` use PyTorch's default
 for linear layers, weights and biases uniform in +-1/sqrt(inputs); `LeakyLayers`, as in Point-NeRF
 and its successors, uniform Xavier weights with the gain of the activation, and zero biases.
 
-Indexing of rows of a large table, with a sparse gradient.
-
-The gradient of indexing a tensor is a dense tensor as large as the whole. Here it is a sparse
-tensor of the indexed rows only, so that neither memory nor an optimizer with support for it
+The gradient of indexing a tensor is dense and as large as the whole. That of `take_rows` is a
+sparse tensor of the indexed rows only, so that neither memory nor an optimizer with support for it
 (`training.optim.RowAdam`) touches the others.
 """
 

@@ -94,8 +94,6 @@ def _fields_in_source(module: str, name: str, found: SourceNames) -> Iterator[st
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
-    for imported in {module for module, _ in homes.values() if module.endswith(".renamed")}:
-        found.old |= _keys(_source(imported))
     classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
     homes |= {one: (module, one) for one in classes}
     if name not in classes:

@@ -8,22 +8,17 @@ from anywhere: a camera, another model's renders, or a network that makes images
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-from jaxtyping import Float
-from torch import Tensor, nn
-
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import Batch, Pixels
+from sharpfield.core.measurements import Batch, Pixels, Terms
 from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
 from sharpfield.core.tone import tone_of
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of, published
 from sharpfield.recipes.volume.moving_scenes import WarpedOptions, WarpedScene
-from sharpfield.recipes.volume.scene import stages
-from sharpfield.recipes.volume.terms import Terms
+from sharpfield.recipes.volume.scene import FrameModel, stages
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pixel_table
 
 
@@ -37,11 +32,6 @@ def standard(recipe: "DNeRF") -> "DNeRF":
     """Half as wide; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
     return replace(recipe.lasting(40_000), lr=1e-3, pixels=1024, scene=scene)
-
-
-def published(recipe: "DNeRF") -> "DNeRF":
-    """The published networks and length."""
-    return recipe
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ class DNeRF:
         return Model(self, capture, seed)
 
 
-class Model(nn.Module):
+class Model(FrameModel):
     """A dynamic scene and its frames; events are not used."""
 
     heaviest_step = 0
@@ -122,10 +112,6 @@ class Model(nn.Module):
     def render(self, rays: Rays) -> Radiance:
         """Linear light along rays."""
         return self.scene.view(rays)
-
-    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """Linear light as stored values, 0...1."""
-        return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
         """Parameters of all networks with their learning rate."""

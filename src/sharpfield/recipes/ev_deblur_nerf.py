@@ -10,23 +10,21 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.measurements import Batch, EventPairs, Pixels
+from sharpfield.core.measurements import Batch, EventPairs, Pixels, Terms
 from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule, cosine, exponential, scaled
 from sharpfield.core.tone import tone_of
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of
 from sharpfield.recipes.volume.learned_blur import KernelOptions, LearnedBlur, share_of_adaptive
 from sharpfield.recipes.volume.scene import (
     DRAFT,
     GRID_RATE,
     STANDARD,
+    FrameModel,
     Volume,
     VolumeOptions,
     stages,
@@ -40,7 +38,6 @@ from sharpfield.recipes.volume.terms import (
     MiddlePrior,
     MotionTerm,
     PriorOptions,
-    Terms,
 )
 
 NETWORK_RATE = 5e-3
@@ -206,7 +203,7 @@ class EvDeblurNeRF:
         return Model(self, capture, seed)
 
 
-class Model(nn.Module):
+class Model(FrameModel):
     """The model on one capture; terms of missing frames or events are left out."""
 
     def __init__(self, recipe: EvDeblurNeRF, capture: Capture, seed: int) -> None:
@@ -267,10 +264,6 @@ class Model(nn.Module):
     def render(self, rays: Rays) -> Radiance:
         """Sharp linear light along rays, without kernel or noise."""
         return self.volume.view(rays)
-
-    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """Linear light as stored values, 0...1."""
-        return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
         """Parameters of networks, grids, kernel and response with their learning rates."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import Batch, EventPairs
+from sharpfield.core.measurements import Batch, EventPairs, Terms
 from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group
@@ -23,11 +23,9 @@ from sharpfield.events.threshold import thresholds_of
 from sharpfield.formation.events import LogContrast
 from sharpfield.formation.response import FixedResponse
 from sharpfield.losses.events import dead_zone_error, scaled_error
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of, published
 from sharpfield.recipes.volume.moving_scenes import WarpedOptions, WarpedScene
 from sharpfield.recipes.volume.scene import stages
-from sharpfield.recipes.volume.terms import Terms
 from sharpfield.sampling.binned import BinnedTable, Halved, binned_table, draw_binned, open_windows
 from sharpfield.storage.event_cache import event_index
 
@@ -98,11 +96,6 @@ def standard(recipe: "EvDNeRF") -> "EvDNeRF":
     """Half as wide and a tenth as long; for a GPU."""
     scene = replace(recipe.scene, width=128, samples=(48, 64))
     return replace(recipe.lasting(20_000), lr=5 * recipe.lr, scene=scene)
-
-
-def published(recipe: "EvDNeRF") -> "EvDNeRF":
-    """The published networks and length."""
-    return recipe
 
 
 @dataclass(frozen=True)

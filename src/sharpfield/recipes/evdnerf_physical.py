@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import Batch, EventPairs, Pixels
+from sharpfield.core.measurements import Batch, EventPairs, Pixels, Terms
 from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
@@ -28,10 +28,9 @@ from sharpfield.formation.response import FixedResponse
 from sharpfield.formation.shutter import Shutter
 from sharpfield.losses.events import counted_error, exact_error
 from sharpfield.losses.photometric import mse
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of
 from sharpfield.recipes.volume.moving_scenes import MovingOptions, MovingScene
-from sharpfield.recipes.volume.terms import Terms
+from sharpfield.recipes.volume.scene import FrameModel
 from sharpfield.sampling.event_windows import Lengths, draw_spans, draw_windows
 from sharpfield.sampling.pixels_and_pairs import draw_pixels, pair_table, pixel_table
 from sharpfield.storage.event_cache import event_index
@@ -130,7 +129,7 @@ class EvDNeRFPhysical:
         return Model(self, capture, seed)
 
 
-class Model(nn.Module):
+class Model(FrameModel):
     """A dynamic scene, its events and its frames."""
 
     heaviest_step = 0
@@ -226,10 +225,6 @@ class Model(nn.Module):
     def render(self, rays: Rays) -> Radiance:
         """Sharp linear light along rays."""
         return self.scene.view(rays)
-
-    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """Linear light as stored values, 0...1."""
-        return self.tone.encode(light).clamp(0, 1)
 
     def log_light(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b"]:
         """Log intensity of the event camera."""

@@ -29,8 +29,7 @@ from sharpfield.recipes.points.hybrid_checkpoint import load_released
 from sharpfield.recipes.points.images import ImageBranch, SourceOptions
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import PointScene
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of, published
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ class Hybrid(PointNeRF):
     }
     presets: ClassVar[Presets] = Presets(
         variants={"h-only": h_only, "rooms": rooms, "learned": learned, "no-images": no_images},
-        sizes={"draft": draft, "standard": standard, "paper": point_nerf.published},
+        sizes={"draft": draft, "standard": standard, "paper": published},
         renamed={"no-pictures": "no-images"},
     )
 

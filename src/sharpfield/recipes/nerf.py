@@ -8,19 +8,22 @@ same method trains in minutes instead of hours.
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-from jaxtyping import Float
-from torch import Tensor, nn
-
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import Batch, Pixels
+from sharpfield.core.measurements import Batch, Pixels, Terms
 from sharpfield.core.protocols import Paper
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, constant, exponential, scaled
 from sharpfield.core.tone import tone_of
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
-from sharpfield.recipes.volume.scene import DRAFT, GRID_RATE, STANDARD, Volume, VolumeOptions
-from sharpfield.recipes.volume.terms import FrameOptions, KernelTerm, Terms
+from sharpfield.recipes.settings.presets import Presets, paper_of, published
+from sharpfield.recipes.volume.scene import (
+    DRAFT,
+    GRID_RATE,
+    STANDARD,
+    FrameModel,
+    Volume,
+    VolumeOptions,
+)
+from sharpfield.recipes.volume.terms import FrameOptions, KernelTerm
 
 
 def draft(recipe: "NeRF") -> "NeRF":
@@ -34,11 +37,6 @@ def standard(recipe: "NeRF") -> "NeRF":
     """Factored feature volumes; minutes on a GPU."""
     volume = VolumeOptions(kind="planes", noise=0.0, density="softplus", **STANDARD)
     return NeRF(steps=10_000, lr=5e-3, lr_decay_steps=3333, tv_weight=0.02, volume=volume)
-
-
-def published(recipe: "NeRF") -> "NeRF":
-    """The published networks and length."""
-    return NeRF()
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ class NeRF:
         return Model(self, capture, seed)
 
 
-class Model(nn.Module):
+class Model(FrameModel):
     """A radiance field and its frames, one ray per pixel."""
 
     heaviest_step = 0
@@ -122,10 +120,6 @@ class Model(nn.Module):
     def render(self, rays: Rays) -> Radiance:
         """Linear light along rays."""
         return self.volume.view(rays)
-
-    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
-        """Linear light as stored values, 0...1."""
-        return self.tone.encode(light).clamp(0, 1)
 
     def groups(self) -> list[Group]:
         """Parameters of networks and grids with their learning rates."""

@@ -13,8 +13,7 @@ from sharpfield.fields.neural_points import PointSizes
 from sharpfield.initialisation.point_cloud import CloudOptions
 from sharpfield.recipes.points.model import PatchSamplingOptions, PointModel
 from sharpfield.recipes.points.scene import GrowthOptions, MarchOptions, PointScene
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of, published
 
 R = TypeVar("R", bound="PointNeRF")
 
@@ -29,11 +28,6 @@ def standard(recipe: R) -> R:
     """Minutes on a GPU, hours on a CPU."""
     recipe = quick(recipe, points=1_000_000, width=128, feature=128, pixels=3136, samples=16)
     return replace(recipe.lasting(20_000), lr=1e-3, points_lr=4e-3, lr_final=0.05)
-
-
-def published(recipe: R) -> R:
-    """The published networks, points and length."""
-    return recipe
 
 
 def quick(recipe: R, *, points: int, width: int, feature: int, pixels: int, samples: int) -> R:

@@ -16,8 +16,7 @@ from sharpfield.core.protocols import Paper
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds, thresholds_of
 from sharpfield.initialisation.posed_images import sharp_light_images
-from sharpfield.recipes.settings.papers import paper_of
-from sharpfield.recipes.settings.presets import Presets
+from sharpfield.recipes.settings.presets import Presets, paper_of
 from sharpfield.recipes.splats.learned_calibration import LearnedCalibrationOptions
 from sharpfield.recipes.splats.model import SplatModel, align_events_to_rolling_shutter
 from sharpfield.recipes.splats.scene import GaussianOptions, MotionOptions

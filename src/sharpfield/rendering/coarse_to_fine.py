@@ -1,16 +1,13 @@
 """Hierarchical volume rendering: coarse samples, then fine samples by importance.
 
+Heads are evaluated in chunks of points, and their activations, most of a training step's memory,
+are recomputed in the backward pass (gradient checkpointing), so that a step keeps only the
+looked-up features. A chunk fits the CPU's cache, which on a CPU makes this faster than keeping
+them. Most points are empty or occluded: those of negligible weight need no colour and get no
+gradient; only their density is computed, and only the others take part in the backward pass.
+
 Source: NeRF (ECCV 2020), section 5.2; the released code of Ev-DeblurNeRF for the details of
 sampling and compositing.
-
-Evaluate a head at points along rays and composite the result, in chunks.
-
-The activations of heads are most of a training step's memory. They are recomputed in the backward
-pass (gradient checkpointing), chunk by chunk, so that a step keeps only the looked-up features. A
-chunk fits the CPU's cache, which on a CPU makes this faster than keeping them.
-
-Most points are empty or occluded. Points of negligible weight need no colour and get no gradient:
-only their density is computed, and only the other points take part in the backward pass.
 """
 
 from collections.abc import Callable

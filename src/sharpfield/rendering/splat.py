@@ -1,20 +1,16 @@
-"""Views of Gaussians, by rasterization.
+"""Views of Gaussians, by rasterization, through any lens and with a global or rolling shutter.
 
 The colours of Gaussians are *stored* values, as in frames and in the files of splat viewers; a tone
 curve turns them into linear light before they are blended, because light adds up and stored values
 do not. Depth is the distance along the optical axis, in world units.
 
-Images of Gaussians through lenses with distortion, resampled from pinhole images.
+Of a lens with distortion, a *flat* image is rendered: that of a pinhole camera with the same pose,
+just wide and fine enough. Every pixel of the real camera takes its bilinear interpolation at the
+position of the pixel's ray. Both have the same optical axis, so that depth along it stays the same.
 
-A *flat* image is that of a pinhole camera with the same pose, just wide and fine enough. Every
-pixel of the real camera takes the bilinear interpolation of the flat image at the position of its
-ray. Both have the same optical axis, so that depth along it stays the same.
-
-Rolling shutter for splats: each Gaussian is projected with the pose at the time of its own row.
-
-The row determines the time, and the pose at that time the row: a fixed-point iteration of two
-steps. Shape, colour and depth order are those of the middle row's pose: over a readout they hardly
-change, while positions do.
+With a rolling shutter, each Gaussian is projected with the pose at the time of its own row. The row
+determines the time, and the pose at that time the row: a fixed-point iteration of two steps. Shape,
+colour and depth order are those of the middle row's pose, as over a readout they hardly change.
 
 Source: Seiskari et al., "Gaussian Splatting on the Move" (ECCV 2024), with the motion over the
 readout as piecewise-linear poses instead of one velocity.

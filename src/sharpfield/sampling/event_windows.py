@@ -1,17 +1,12 @@
-"""What each camera's events say: latent frames at any time, and counts between two times.
+"""Events of each camera in windows of time: of all its pixels for views, or of random pixels.
 
-A *window* is the time from one instant of a batch to the next. Whole events are counted exactly;
-the part of an event that light was on its way at either end is estimated from the pixel's events
-around it (its *phase*).
-
-Events counted in windows of time, of any pixel of any camera.
-
-Vocabulary: a *window* is a pixel and two instants; its counts are those of the events after the
-first instant up to and including the second. Its length is log-uniform, so that short windows are
-as frequent as long ones. A *span* is a window that begins and ends with an event of its pixel. At
-these instants the reference level of the pixel equals its log light, so that the counts of a span
-measure the change of light exactly, while at the ends of other windows there is an unknown rest of
-up to a threshold.
+A *window* is a pixel and two instants; its counts are those of the events after the first instant
+up to and including the second. For views, the part of an event that light was on its way at either
+end is estimated from the pixel's events around it (its *phase*). Windows of random pixels have a
+log-uniform length, so that short ones are as frequent as long ones. A *span* is a window that
+begins and ends with an event of its pixel. At these instants the reference level of the pixel
+equals its log light, so that the counts of a span measure the change of light exactly, while at the
+ends of other windows there is an unknown rest of up to a threshold.
 
 Source: EvDNeRF (WACV 2024) for windows of half event pixels and half random pixels over all views;
 Robust e-NeRF (ICCV 2023) for reference levels.

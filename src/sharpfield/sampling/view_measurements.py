@@ -1,8 +1,7 @@
 """What was measured of whole views: frames, latent frames, event windows and depth, as tensors.
 
 Leading axes: m cameras, then k instants (or k - 1 windows); then the rows and columns of the crop.
-
-Depth maps of a depth camera, resampled to the pixels of the frames.
+Depth maps are resampled to the pixels of the frames.
 """
 
 from dataclasses import dataclass

@@ -4,9 +4,7 @@ The eight *corners* of the cell that a point is in are numbered 0...7, along x f
 of a lookup are: four values that were read or are to be added, the first corner of the cell, and
 the fraction of the way to the next along each axis.
 
-The samples of a ray as marching kernels record them, their composite, and its gradient.
-
-A ray has a table with a row for each sample: its number along the ray, its opacity (alpha), its
+Marching kernels record the samples of a ray in a table with a row for each: its number along the ray, its opacity (alpha), its
 weight (the share of the ray's light that it contributes), the slope of softplus, and three colours.
 """
 
@@ -185,9 +183,6 @@ def _time_gradient_of(values, rows, first, buffers):
                 change *= _corner_weight(buffers, number, np.float32(1.0))
                 gradient += change if t else -change
     return gradient * np.float32(0.5 * (len(rows) - 1))
-
-
-# pyright: basic
 
 
 PARTS = 2

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import Batch, Pixels
+from sharpfield.core.measurements import Batch, Pixels, Terms
 from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, exponential
@@ -34,8 +34,6 @@ from sharpfield.sampling.pixels_and_pairs import PatchShape, draw_patches, pixel
 
 if TYPE_CHECKING:  # which imports this module
     from sharpfield.recipes.point_nerf import PointNeRF
-
-Terms = dict[str, Tensor]
 
 
 @dataclass(frozen=True)

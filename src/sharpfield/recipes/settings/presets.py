@@ -2,21 +2,26 @@
 
 A *variant* says what is modelled (`blender_full`, `physical`, ...), a *size* how much of it a
 machine can take (`draft`, `standard`, `paper`). `--preset physical,draft` applies both. A recipe
-states its presets in the class variable `presets`, also a recipe of another package.
+states its presets in the class variable `presets`, also a recipe of another package; and the
+publication behind it in `paper`, which for ours is in `recipes/papers.toml`.
 """
 
+import tomllib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sharpfield.core.errors import Hint, OptionError, did_you_mean
 from sharpfield.recipes import recipe_named
 
 if TYPE_CHECKING:  # a list of recipes needs no torch
     from sharpfield.core.capture import Capture
-    from sharpfield.core.protocols import Recipe
+    from sharpfield.core.protocols import Paper, Recipe
 
+R = TypeVar("R")
 Change = Callable[[Any], Any]
 """From a recipe to a changed one; the first line of its docstring says what it means."""
 
@@ -63,6 +68,11 @@ class Presets:
         return recipe
 
 
+def published(recipe: R) -> R:
+    """The published networks and length."""
+    return recipe
+
+
 NO_PRESETS = Presets()
 
 
@@ -93,3 +103,23 @@ def prepared(name: str, preset: str = "", *, capture: "Capture", device: str) ->
         size = next((one for one in chosen if one in presets.sizes), "")
         chosen.append(presets.variant_for(capture, size))
     return presets.apply(chosen, kind())
+
+
+def paper_of(recipe: str) -> "Paper":
+    """The publication of one of our recipes, with the departures of the recipe from it.
+
+    Args:
+        recipe: By the name that the command line knows.
+    """
+    from sharpfield.core.protocols import Paper  # with torch, which presets do not need
+
+    own = _tables()[recipe]
+    cited = _tables()[own.get("reference", recipe)]
+    earlier = paper_of(own["departures_of"]).departures if "departures_of" in own else ()
+    departures = (*earlier, *own.get("departures", ()))
+    return Paper(cited["key"], cited["title"], cited["bibtex"], departures)
+
+
+@cache
+def _tables() -> dict[str, dict[str, Any]]:
+    return tomllib.loads(resources.files("sharpfield.recipes").joinpath("papers.toml").read_text())

@@ -17,7 +17,7 @@ from sharpfield.captures.splits import Block
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
-from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels
+from sharpfield.core.measurements import Batch, Depths, EventPairs, Instants, Pixels, Terms
 from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Rays, Views
 from sharpfield.core.schedule import Group
@@ -45,8 +45,6 @@ from sharpfield.recipes.splats.learned_calibration import (
 from sharpfield.recipes.splats.scene import GaussianOptions, MotionOptions, SplatScene, cooldown
 from sharpfield.sampling.views import SamplingOptions, ViewSampler
 from sharpfield.storage.event_cache import event_index
-
-Terms = dict[str, Tensor]
 
 
 class SplatModel(nn.Module):

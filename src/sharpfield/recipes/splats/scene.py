@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Capture
+from sharpfield.core.measurements import Terms
 from sharpfield.core.protocols import Growth, PointSet
 from sharpfield.core.rays import Radiance, Views
 from sharpfield.core.schedule import Group, Schedule, constant, exponential, scaled
@@ -24,8 +25,6 @@ from sharpfield.geometry.rolling import Rolling
 from sharpfield.initialisation.static_scene import background_colour
 from sharpfield.recipes.splats.strategy import DensifyStrategy, GrowthPlan, McmcStrategy, Strategy
 from sharpfield.rendering.splat import Cloud, Splatting
-
-Terms = dict[str, Tensor]
 
 COOLED = 0.05
 """What is left of a learning rate at the end of the schedule, relative to where growth ended."""

@@ -13,6 +13,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
+from sharpfield.core.tone import Tone
 from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.plane_grid import HeadSize, PlaneField
 from sharpfield.fields.voxels import VoxelField, shapes_in
@@ -83,6 +84,16 @@ STANDARD: dict[str, Any] = {
 def soft(raw: torch.Tensor) -> torch.Tensor:
     """Shifted softplus: density starts low, so that rays pass through an untrained scene."""
     return nn.functional.softplus(raw - 1)
+
+
+class FrameModel(nn.Module):
+    """What models of frames share: the tone curve of the capture."""
+
+    tone: Tone
+
+    def encode(self, light: Float[Tensor, "*b c"]) -> Float[Tensor, "*b c"]:
+        """Linear light as stored values, 0...1."""
+        return self.tone.encode(light).clamp(0, 1)
 
 
 ACTIVATIONS = {"relu": torch.relu, "softplus": soft}

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.measurements import EventPairs, Pixels
+from sharpfield.core.measurements import EventPairs, Pixels, Terms
 from sharpfield.core.protocols import Response
 from sharpfield.core.rays import Radiance, Rays
 from sharpfield.core.schedule import Group, Schedule
@@ -112,9 +112,6 @@ class InstantsPrior(nn.Module):
         ratio = self.ratio[seen.frame, :, y, x].float()
         light = self.tone.decode(seen.value)[:, None] * ratio
         return self.tone.encode(light.clamp(0, 1))
-
-
-Terms = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
