@@ -4,8 +4,9 @@ The eight *corners* of the cell that a point is in are numbered 0...7, along x f
 of a lookup are: four values that were read or are to be added, the first corner of the cell, and
 the fraction of the way to the next along each axis.
 
-Marching kernels record the samples of a ray in a table with a row for each: its number along the ray, its opacity (alpha), its
-weight (the share of the ray's light that it contributes), the slope of softplus, and three colours.
+Marching kernels record the samples of a ray in a table with a row for each: its number along the
+ray, its opacity (alpha), its weight (the share of the ray's light that it contributes), the slope
+of softplus, and three colours.
 """
 
 import math
