@@ -6,7 +6,12 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sharpfield.evaluation.event_videos import GAP_PX, WINDOWS, events_section, write_event_videos
+from sharpfield.evaluation.event_scores import (
+    GAP_PX,
+    VIDEO_WINDOWS,
+    events_section,
+    write_event_videos,
+)
 from sharpfield.evaluation.measure import evaluate
 from sharpfield.evaluation.report import RunDescription, write_report
 from tests.evaluation.test_event_scores import Scene
@@ -23,7 +28,7 @@ def test_a_video_shows_what_was_recorded_beside_what_is_predicted(tmp_path: Path
     moving = tiny_moving()
     (told,) = write_event_videos(Scene(moving, 1.0), moving, tmp_path)
     video = frames_of(tmp_path / told["video"])
-    assert video.shape == (WINDOWS, 240, 2 * 240 + GAP_PX, 3)
+    assert video.shape == (VIDEO_WINDOWS, 240, 2 * 240 + GAP_PX, 3)
     recorded, predicted = (part.astype(int) for part in (video[:, :, :240], video[:, :, -240:]))
     assert brighter(recorded).any() and brighter(-recorded).any()
     # of the true scene: what is predicted happened; remainders at both ends are left out

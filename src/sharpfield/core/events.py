@@ -63,8 +63,8 @@ class EventStream:
         first, last = np.searchsorted(self.t_us, [start_us, end_us], side="left")
         return self[int(first) : int(last)]
 
-    def __getitem__(self, part: slice) -> "EventStream":
-        """A slice of the stream, as views."""
+    def __getitem__(self, part: slice | Int64[np.ndarray, "k"]) -> "EventStream":
+        """A slice of the stream, as views, or the events of some indices, copied."""
         return self._taken(part)
 
     def of_track(self, track: int) -> "EventStream":

@@ -30,10 +30,10 @@ def replacing(path: Path) -> Generator[Path, None, None]:
         temporary.unlink(missing_ok=True)
 
 
-def write_json(path: Path, about: Any) -> None:
+def write_json(path: Path, about: Any, *, allow_nan: bool = True) -> None:
     """Write plain values for people and programs to read, in place of what was at `path`."""
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(about, indent=2) + "\n")
+        temporary.write_text(json.dumps(about, indent=2, allow_nan=allow_nan) + "\n")
 
 
 @contextlib.contextmanager

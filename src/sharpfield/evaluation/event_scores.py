@@ -4,12 +4,18 @@ An *event frame* holds, for each pixel, the change of log intensity in a time wi
 model, or the signed count of events times their thresholds. Each window belongs to one camera. All
 metrics are means over event frames.
 
-Source: EvDNeRF (WACV 2024) and its released evaluation for PSNR, SSIM and MAE of event frames.
+A video shows one window after the other, recorded on the left, predicted on the right, in one
+scale. The prediction is the published one: the change of log light over a window in whole
+thresholds. (The `events` command renders event streams instead.)
+
+Source: EvDNeRF (WACV 2024), its figures and videos, and its released evaluation for PSNR, SSIM and
+MAE of event frames.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -28,6 +34,10 @@ from sharpfield.formation.response import FLOOR
 from sharpfield.metrics.image import ssim
 from sharpfield.metrics.registry import Metric
 from sharpfield.rendering.view import render_view, renderer_of
+from sharpfield.report.colormaps import Rgb, colour_signs, side_by_side
+from sharpfield.report.event_frames import full_count
+from sharpfield.report.page import TextTable
+from sharpfield.report.video import write_video
 from sharpfield.storage.event_cache import event_index
 
 WINDOWS = 8
@@ -36,8 +46,6 @@ LENGTHS = (1 / 32, 1 / 128)
 """Lengths of the windows as shares of the capture: the longest of the paper's, and the shortest."""
 MOST_COUNT = 20.0
 """Counts are clipped to this where the range of a metric is fixed."""
-
-EventScores = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -213,7 +221,7 @@ def mean_threshold(capture: Capture) -> float:
     return sum(thresholds_of(capture)) / 2
 
 
-def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> EventScores:
+def _scores(pairs: Sequence[tuple[Tensor, Tensor]], capture: Capture) -> dict[str, float]:
     """Means over event frames, each a predicted change `[h w]` and recorded counts `[2 h w]`."""
     off, on = thresholds_of(capture)
     recorded = torch.stack([on * counts[1] - off * counts[0] for _, counts in pairs])  # [n, h, w]
@@ -235,3 +243,83 @@ def _f1(predicted: Tensor, recorded: Tensor) -> float:
     both = int((predicted & recorded).sum())
     total = int(predicted.sum()) + int(recorded.sum())
     return 2 * both / total if total else 1.0
+
+
+CAMERAS = 2
+"""Most cameras with a video, evenly spread over those held out."""
+VIDEO_WINDOWS = 20
+"""Windows of a video; together they cover the capture."""
+FPS = 8.0
+"""Windows per second of the video."""
+HEIGHT_PX = 240
+"""Smaller images are enlarged by a whole factor up to this height."""
+GAP_PX = 4
+"""Gap between the two images."""
+
+
+def write_event_videos(model: Model, capture: Capture, run: Path) -> list[dict[str, Any]]:
+    """Write videos of some held-out event cameras to `run/renders/events/`.
+
+    Returns:
+        The number of each camera, and where its video is.
+    """
+    held_out = capture.test_events
+    if held_out is None or not len(held_out):
+        return []
+    tracks = np.unique(np.asarray(held_out.track)) if held_out.track is not None else np.zeros(1)
+    chosen = tracks[np.linspace(0, len(tracks) - 1, min(CAMERAS, len(tracks))).astype(int)]
+    found = []
+    for track in chosen.astype(int).tolist():
+        path = Path("renders") / "events" / f"{track:02d}.mp4"
+        (run / path).parent.mkdir(parents=True, exist_ok=True)
+        write_video(run / path, _images(model, capture, track), fps=FPS)
+        found.append({"track": track, "video": path.as_posix()})
+    return found
+
+
+def events_section(run: Path, metrics: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What the page shows of held-out event cameras; None if there are none."""
+    events = metrics.get("events")
+    if events is None:
+        return None
+    known = [metric for metric in EVENT_METRICS if metric.name in events["definitions"]]
+    rows = tuple(
+        (
+            f"1/{1 / float(length):.0f} of the capture",
+            *(metric.text(scores.get(metric.name)) for metric in known),
+        )
+        for length, scores in events["lengths"].items()
+    )
+    return {
+        "videos": [
+            (one["track"], (run / one["video"]).read_bytes())
+            for one in events.get("videos", [])
+            if (run / one["video"]).is_file()
+        ],
+        "table": TextTable(("windows", *(metric.title for metric in known)), rows),
+        "definitions": events["definitions"],
+    }
+
+
+def _images(model: Model, capture: Capture, track: int) -> list[Rgb]:
+    """Recorded and predicted event frame of each window side by side."""
+    assert capture.test_events is not None
+    index = event_index(capture.test_events)
+    ends = np.linspace(0, 1, VIDEO_WINDOWS + 1)
+    log_images = [render_log_intensity(model, track, float(time)) for time in ends]
+    predicted = [
+        ((after - before) / mean_threshold(capture)).trunc().numpy()
+        for before, after in zip(log_images, log_images[1:], strict=False)
+    ]
+    counts = [
+        count_recorded(capture, index, track, (float(a), float(b))).numpy()
+        for a, b in zip(ends, ends[1:], strict=False)
+    ]
+    recorded = [brighter - darker for darker, brighter in counts]
+    full = full_count(np.stack(recorded).astype(np.int32))
+    factor = max(HEIGHT_PX // capture.camera.height, 1)
+    columns = [
+        [np.kron(colour_signs(one, full), np.ones((factor, factor, 1), np.uint8)) for one in frames]
+        for frames in (recorded, predicted)
+    ]
+    return [side_by_side(*pair, gap_px=GAP_PX, grey=128) for pair in zip(*columns, strict=True)]

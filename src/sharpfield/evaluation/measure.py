@@ -5,27 +5,31 @@ compared in the display domain, as the frames store them.
 
 Views are rendered at the middle of the exposure of a frame, in the model's world. The capture that
 is compared with may hold more than the model was trained on (frames, for a model trained on events
-alone), as long as both have the same clock.
+alone), as long as both have the same clock. The protocol holds everything that is needed to
+reproduce the metrics.
 """
 
 import json
 import math
-from collections.abc import Mapping
+import platform
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
+import sharpfield
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.brightness import Brightness
-from sharpfield.evaluation.event_scores import score_events
-from sharpfield.evaluation.event_videos import write_event_videos
-from sharpfield.evaluation.protocol import describe_protocol
+from sharpfield.evaluation.event_scores import score_events, write_event_videos
 from sharpfield.evaluation.refine import training_pose_errors
 from sharpfield.evaluation.scores import (
     DEPTH_ERROR,
@@ -38,6 +42,7 @@ from sharpfield.evaluation.scores import (
     view_metrics,
 )
 from sharpfield.evaluation.views import (
+    Reference,
     RenderedView,
     brightness_of,
     held_out,
@@ -50,6 +55,67 @@ from sharpfield.metrics.registry import Metric
 from sharpfield.rendering.view import CHUNK, Progress, ViewRenderer, renderer_of
 from sharpfield.report.colormaps import colour_depth, eight_bit
 from sharpfield.storage.images import write_image
+
+ENABLE_LPIPS = (
+    "give torchvision's AlexNet weights (alexnet-owt-7be5be79.pth) and the linear layers of LPIPS"
+    " v0.1 (alex.pth, part of the packages lpips and torchmetrics)"
+)
+
+
+def describe_protocol(
+    capture: Capture, test: Sequence[Reference], lpips: Lpips | None, *, too_small: bool = False
+) -> dict[str, Any]:
+    """The part of the protocol that depends on the capture and on the definitions.
+
+    `too_small` images for its network are why LPIPS is None.
+    """
+    frames = capture.frames
+    return {
+        "capture": capture.name,
+        "layout": capture.source,
+        "resolution": list(capture.camera.size),
+        "encoding": frames.encoding if frames is not None else None,
+        "split": {
+            "train": len(capture.split.train),
+            "test": len(capture.split.test),
+            "test_frames": [reference.name for reference in test],
+        },
+        "references": dict(Counter(reference.kind for reference in test)),
+        "why_no_scores": _why_no_scores(capture, test),
+        "domain": "display (as stored), 0...1; renders clamped, not quantised",
+        "averaging": "mean over views of the number of each view",
+        # Metrics of events have their definitions beside their values.
+        **{
+            one.name: one.definition
+            for one in (*view_metrics().values(), PSNR_ALIGNED, DEPTH_ERROR)
+        },
+        "lpips": _lpips(lpips, too_small),
+        "pose_refinement": "none",
+        "versions": {
+            "sharpfield": sharpfield.__version__,
+            "torch": torch.__version__,
+            "numpy": numpy.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def _why_no_scores(capture: Capture, test: Sequence[Reference]) -> str | None:
+    if test:
+        return None
+    if capture.frames is None:
+        return "the capture has no frames to compare with"
+    return "the capture holds no frame out"
+
+
+def _lpips(lpips: Lpips | None, too_small: bool) -> dict[str, Any]:
+    if lpips is not None:
+        return {"computed": True, "version": "0.1", "network": lpips.network, **lpips.sha256}
+    if too_small:
+        reason = f"images are smaller than the network allows ({SMALLEST_PX} px)"
+        return {"computed": False, "reason": reason, "enable": "evaluate at a larger size"}
+    return {"computed": False, "reason": "no weights were given", "enable": ENABLE_LPIPS}
+
 
 METRICS = "metrics.json"
 
@@ -121,8 +187,9 @@ def evaluate(
         for references in (test, train)
     )
     brightness = brightness_of(model, test_views or train_views, blind=options.events_only)
-    lpips = options.lpips if _large_enough(options.lpips, capture) else None
-    too_small = options.lpips is not None and lpips is None
+    lpips = options.lpips
+    too_small = lpips is not None and min(capture.camera.size) < SMALLEST_PX[lpips.network]
+    lpips = None if too_small else lpips
     known, renders = view_metrics(lpips), run / "renders"
     tested = [_row(view, brightness, known, renders / "test") for view in test_views]
     learned = [_row(view, brightness, known, renders / "train") for view in train_views]
@@ -146,8 +213,7 @@ def evaluate(
         metrics["poses"] = errors
     if baselines:
         metrics["baselines"] = {name: dict(values) for name, values in baselines.items()}
-    with replacing(run / METRICS) as temporary:
-        temporary.write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n")
+    write_json(run / METRICS, metrics, allow_nan=False)
     return metrics
 
 
@@ -200,9 +266,8 @@ def _capture_metrics(
     """Metrics that need events or depth of the capture, over all held-out views."""
     found: dict[str, float] = {}
     if events is not None:
-        longest = max(events["lengths"], key=float)
-        scores = events["lengths"][longest]
-        found |= {name: scores[name] for name in ("event_psnr", "event_mae")}
+        longest = events["lengths"][max(events["lengths"], key=float)]
+        found |= {name: longest[name] for name in ("event_psnr", "event_mae")}
     pairs = [(view.light, image) for view in views if (image := view.reference.image) is not None]
     if pairs and capture.events is not None:
         found[PSNR_ALIGNED.name] = math.fsum(
@@ -274,7 +339,3 @@ def _expect_same_size(model: Model, capture: Capture) -> None:
             got=f"frames {capture.camera.size}, model {model.capture.camera.size}",
             do="evaluate on the capture it was trained on",
         )
-
-
-def _large_enough(lpips: Lpips | None, capture: Capture) -> bool:
-    return lpips is not None and min(capture.camera.size) >= SMALLEST_PX[lpips.network]

@@ -8,7 +8,6 @@ Source of the spiral: Mildenhall et al., *Local Light Field Fusion* (SIGGRAPH 20
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,13 +63,11 @@ def camera_path(capture: Capture, path: str, *, images: int = 60) -> RenderPath:
     kind, _, argument = path.partition(":")
     if kind == "exposure" and argument.isdecimal():
         return path_in_exposure(capture, int(argument), images)
-    makers: dict[str, Callable[[Capture, int], RenderPath]] = {
-        "spiral": spiral_path,
-        "train": recorded_path,
-    }
-    if path not in makers:
-        raise OptionError("unknown camera path", got=path, do=f"use {PATHS}")
-    return makers[path](capture, images)
+    if path == "spiral":
+        return spiral_path(capture, images)
+    if path == "train":
+        return recorded_path(capture, images)
+    raise OptionError("unknown camera path", got=path, do=f"use {PATHS}")
 
 
 def spiral_path(capture: Capture, images: int) -> RenderPath:

@@ -91,13 +91,8 @@ class _Render:
 def aligned_poses(model: Model, capture: Capture) -> dict[int, Pose]:
     """Poses of the held-out frames in the model's space, aligned by the training frames.
 
-    Args:
-        model: Its capture may have refined poses, or another space altogether.
-        capture: With the measured poses.
-
-    Returns:
-        A pose for each held-out frame; the model's own where fewer than three training cameras,
-        or cameras on one line, do not determine a similarity.
+    The model's capture may have refined poses, or another space altogether. Where fewer than three
+    training cameras, or cameras on one line, do not determine a similarity, poses are its own.
     """
     train, test = capture.split.train, capture.split.test
     measured = _poses(capture, capture, train)
@@ -114,10 +109,6 @@ def training_pose_errors(model: Model, capture: Capture) -> dict[str, Any] | Non
 
     Where the capture's poses are the true ones these are trajectory errors; else they tell how far
     refinement moved the poses.
-
-    Args:
-        model: Trained.
-        capture: With the measured poses.
 
     Returns:
         Absolute trajectory error and relative pose error (RMS) of the training frames in order of
@@ -186,7 +177,9 @@ def refine_poses(
             optimizers[step >= RMSPROP_SHARE * options.steps].step()
             if options.every and ((step + 1) % options.every == 0 or step + 1 == options.steps):
                 last = _render_all(model, views, twists)
-                best = list(map(_better, best, last))
+                best = [
+                    max(pair, key=lambda one: one.psnr) for pair in zip(best, last, strict=True)
+                ]
             if progress is not None:
                 progress(step + 1, options.steps)
     chosen = torch.stack([render.twist for render in best]) if best else twists.detach()
@@ -224,10 +217,6 @@ def _views(model: Model, capture: Capture, start: Mapping[int, Pose]) -> list[_V
         image = reference.image.to(device)
         views.append(_View(reference.frame, pose0, float(time), rows, image))
     return views
-
-
-def _better(one: _Render, other: _Render) -> _Render:
-    return other if other.psnr > one.psnr else one
 
 
 @contextmanager

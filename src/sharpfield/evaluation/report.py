@@ -17,7 +17,7 @@ from sharpfield.core.files import replacing
 from sharpfield.core.protocols import Paper
 from sharpfield.core.seed import evenly_spread
 from sharpfield.core.tone import luma
-from sharpfield.evaluation.event_videos import events_section
+from sharpfield.evaluation.event_scores import events_section
 from sharpfield.evaluation.scores import methods_table, reported_metrics, view_metrics, views_table
 from sharpfield.evaluation.views import SHARP, TRUTH, Reference, held_out, trained_on
 from sharpfield.report.capture import capture_section

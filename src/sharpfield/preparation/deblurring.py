@@ -5,7 +5,7 @@ these is wrong, the images get worse instead of sharper. Output: images, a conta
 and deblurred frames, and metrics.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -188,13 +188,14 @@ def deblur_summary(capture: Capture, made: Deblurred) -> dict[str, object]:
     ]
     used = made.found.thresholds
     return {
-        "thresholds": {
-            "negative": used.negative,
-            "positive": used.positive,
-            "from": made.found.source,
-            "cost": made.found.cost,
+        "thresholds": asdict(used) | {"from": made.found.source, "cost": made.found.cost},
+        "mean": {
+            when: {
+                name: float(np.mean([row[when][name] for row in rows if name in row[when]]))
+                for name in sorted({name for row in rows for name in row[when]})
+            }
+            for when in ("before", "after")
         },
-        "mean": {when: _mean([row[when] for row in rows]) for when in ("before", "after")},
         "frames": rows,
     }
 
@@ -202,23 +203,18 @@ def deblur_summary(capture: Capture, made: Deblurred) -> dict[str, object]:
 def contact_sheet(capture: Capture, made: Deblurred) -> UInt8[np.ndarray, "H W 3"]:
     """Blurred, deblurred and, where known, true images of a few frames side by side."""
     frames = capture.needed_frames
-    rows = evenly_spread(np.arange(len(made.frame)), SHEET_ROWS)
+    height, width = frames.images.shape[1:3]
     lines = []
-    for row in rows:
+    for row in evenly_spread(np.arange(len(made.frame)), SHEET_ROWS):
         frame = int(made.frame[row])
-        line = [frames.images[frame], _middle(made.images[row])]
-        truth = _truth(capture, frame)
-        lines.append([_rgb(image) for image in [*line, truth] if image is not None])
-    widest = max(len(line) for line in lines)
-    height, width = lines[0][0].shape[:2]
-    sheet = np.full(
-        (len(lines) * (height + GAP) - GAP, widest * (width + GAP) - GAP, 3), 255, np.uint8
-    )
+        line = [frames.images[frame], _middle(made.images[row]), _truth(capture, frame)]
+        lines.append([stored_as_bytes(image) for image in line if image is not None])
+    shape = len(lines), height + GAP, max(map(len, lines)), width + GAP, 3
+    sheet = np.full(shape, 255, np.uint8)
     for i, line in enumerate(lines):
         for j, image in enumerate(line):
-            top, left = i * (height + GAP), j * (width + GAP)
-            sheet[top : top + height, left : left + width] = image
-    return sheet
+            sheet[i, :height, j, :width] = image
+    return sheet.reshape(shape[0] * shape[1], -1, 3)[:-GAP, :-GAP]
 
 
 def _names(capture: Capture, made: Deblurred) -> list[list[str]]:
@@ -243,14 +239,6 @@ def _scores(capture: Capture, frame: int, image: Image) -> dict[str, float]:
     return scores
 
 
-def _mean(scores: list[dict[str, float]]) -> dict[str, float]:
-    names = {name for score in scores for name in score}
-    return {
-        name: float(np.mean([score[name] for score in scores if name in score]))
-        for name in sorted(names)
-    }
-
-
 def _truth(capture: Capture, frame: int) -> Image | None:
     frames = capture.needed_frames
     return frames.truth[frame] if frames.truth is not None and frames.with_truth[frame] else None
@@ -258,7 +246,3 @@ def _truth(capture: Capture, frame: int) -> Image | None:
 
 def _middle(images: Shaped[np.ndarray, "k h w c"]) -> Image:
     return images[len(images) // 2]
-
-
-def _rgb(image: Image) -> UInt8[np.ndarray, "h w 3"]:
-    return np.broadcast_to(stored_as_bytes(image), (*image.shape[:2], 3))

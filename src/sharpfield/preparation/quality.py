@@ -3,12 +3,12 @@
 `blur_images` makes test data: it blurs a folder of sharp images by random motion kernels.
 """
 
-import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
@@ -114,16 +114,13 @@ def ranking(capture: Capture, found: Quality, measured_by: str) -> Figure:
             for column, k in enumerate(chosen if row == 2 else chosen[::-1]):
                 panel = figure.add_subplot(grid[row, column])
                 frame = int(found.frames[k])
-                panel.imshow(_shown(capture, frame), cmap="gray", vmin=0, vmax=255)
+                image = stored_as_bytes(capture.needed_frames.images[frame])
+                image = image if image.shape[-1] == 3 else image[..., 0]
+                panel.imshow(image, cmap="gray", vmin=0, vmax=255)
                 panel.set_axis_off()
                 name = capture.needed_frames.names[frame]
                 panel.set_title(f"{word if column == 0 else ''} {name}  {found.weights[k]:.2f}")
     return figure
-
-
-def _shown(capture: Capture, frame: int) -> UInt8[np.ndarray, "h w *c"]:
-    image = stored_as_bytes(capture.needed_frames.images[frame])
-    return image if image.shape[-1] == 3 else image[..., 0]
 
 
 def _true_blur(capture: Capture, found: Quality) -> Float64[np.ndarray, "m"] | None:
@@ -162,7 +159,8 @@ def blur_images(
     paths = list_images(folder)
     if not paths:
         raise CaptureError("there are no images", where=folder, do="give PNG or JPEG files")
-    if out.exists() and not (out.is_dir() and (is_result(out) or not any(out.iterdir()))):
+    earlier = (out / ABOUT).is_file()
+    if out.exists() and not (out.is_dir() and (earlier or not any(out.iterdir()))):
         raise CaptureError(
             "will not replace a folder that is not an earlier result",
             where=out,
@@ -179,17 +177,5 @@ def blur_images(
             write_image(fresh / path.name, blurred(read_image(path), drawn.kernel))
             about = {"k": drawn.k, "phi": drawn.phi, "length_px": drawn.length_px}
             rows.append({"name": path.name, "blurred": True, **about})
-        written = {
-            "seed": seed,
-            "k": list(ranges.k),
-            "phi": list(ranges.phi),
-            "probability": ranges.probability,
-            "images": rows,
-        }
-        (fresh / ABOUT).write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+        write_json(fresh / ABOUT, {"seed": seed} | asdict(ranges) | {"images": rows})
     return rows
-
-
-def is_result(folder: Path) -> bool:
-    """Whether a folder was written by `blur_images`."""
-    return (folder / ABOUT).is_file()

@@ -104,29 +104,21 @@ def writing_frames(
         def append(counts: Int32[np.ndarray, "h w 2"]) -> None:
             if not arrays:
                 shapes = {COUNTS: (number, *counts.shape), FRAMES: (number, *counts.shape[:2])}
-                arrays.extend(_on_disk(temporary / name, shape) for name, shape in shapes.items())
+                for name, shape in shapes.items():
+                    array = np.lib.format.open_memmap(temporary / name, "w+", np.int32, shape)
+                    arrays.append(array)
             at = next(done)
             frame = without_low_counts(signed(counts), least_share)
             arrays[0][at], arrays[1][at] = counts, frame
-            histogram[0] = _added(histogram[0], np.bincount(np.abs(frame).ravel()))
+            total = np.bincount(np.abs(frame).ravel(), minlength=len(histogram[0]))
+            total[: len(histogram[0])] += histogram[0]
+            histogram[0] = total
 
         yield append
         assert next(done) == number, "the number of windows differs from the one announced"
         for array in arrays:
             array.flush()
         _draw(temporary, arrays[1], _full(histogram[0]))
-
-
-def _on_disk(path: Path, shape: tuple[int, ...]) -> np.memmap:
-    return np.lib.format.open_memmap(path, "w+", np.int32, shape)
-
-
-def _added(a: Int64[np.ndarray, "n"], b: Int64[np.ndarray, "m"]) -> Int64[np.ndarray, "k"]:
-    """Sum of two histograms of counts."""
-    total = np.zeros(max(len(a), len(b)), np.int64)
-    total[: len(a)] += a
-    total[: len(b)] += b
-    return total
 
 
 def _full(histogram: Int64[np.ndarray, "n"]) -> float:

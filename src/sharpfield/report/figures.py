@@ -40,7 +40,9 @@ def trajectory_figure(capture: Capture) -> str:
     """Camera paths from above and from the side, with exposures and held-out frames."""
     figure, (above, side) = _figure(7.6, 3.4, columns=2)
     paths = _paths(capture)
-    middle = _frame_poses(capture)
+    middle = np.zeros((0, 3, 4))
+    if capture.frames is not None:
+        middle = capture.frame_pose(np.arange(len(capture.frames))).double().numpy()
     centre = average_pose(np.concatenate([*paths, middle]))
     held = np.isin(np.arange(len(middle)), capture.split.test)
 
@@ -182,12 +184,6 @@ def _exposures(capture: Capture) -> list[Float[np.ndarray, "n 3 4"]]:
         )
         for i in np.flatnonzero(~frames.exposure.instant)
     ]
-
-
-def _frame_poses(capture: Capture) -> Float[np.ndarray, "n 3 4"]:
-    if capture.frames is None:
-        return np.zeros((0, 3, 4))
-    return capture.frame_pose(np.arange(len(capture.frames))).double().numpy()
 
 
 def _along(

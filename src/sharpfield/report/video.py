@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,11 +16,6 @@ from jaxtyping import UInt8
 from sharpfield.core.errors import OptionError
 from sharpfield.core.files import replacing, replacing_folder
 from sharpfield.storage.images import list_images, write_image
-
-if TYPE_CHECKING:
-    from av.video.codeccontext import VideoCodecContext
-else:  # PyAV is imported when a video is written
-    VideoCodecContext = Any
 
 QUALITY = 18
 """Constant rate factor of x264: visually lossless."""
@@ -73,7 +68,12 @@ def write_video(path: Path, images: Iterable[Image], *, fps: float = 30.0) -> in
 
 @contextmanager
 def _folder(path: Path) -> Iterator[Writer]:
-    _expect_replaceable(path)
+    if path.exists() and not (path.is_dir() and {*path.iterdir()} <= {*list_images(path)}):
+        raise OptionError(
+            "will not replace a folder that holds other files than images",
+            where=path,
+            do="choose another folder, or empty it",
+        )
     with replacing_folder(path) as temporary:
         count = 0
 
@@ -87,17 +87,21 @@ def _folder(path: Path) -> Iterator[Writer]:
 
 @contextmanager
 def _mp4(path: Path, fps: float) -> Iterator[Writer]:
-    import av
+    import av  # only when a video is written
     from av.video.reformatter import Colorspace
 
     with replacing(path) as temporary:
         with av.open(temporary, "w", options={"movflags": "faststart"}) as file:
             stream = file.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
-            _set_up(stream.codec_context)
+            encoder = stream.codec_context
+            encoder.pix_fmt, encoder.options = "yuv420p", {"crf": str(QUALITY)}
+            # Colours as players expect them: BT.709 (code 1), limited range (code 1).
+            encoder.colorspace = encoder.color_primaries = encoder.color_trc = 1
+            encoder.color_range = 1
 
             def write(image: Image) -> None:
                 even = _even(image)
-                if not stream.codec_context.is_open:
+                if not encoder.is_open:
                     stream.height, stream.width = even.shape[:2]
                 assert even.shape[:2] == (stream.height, stream.width), "images differ in size"
                 frame = av.VideoFrame.from_ndarray(even, format="rgb24")
@@ -105,14 +109,8 @@ def _mp4(path: Path, fps: float) -> Iterator[Writer]:
                 file.mux(stream.encode(frame))
 
             yield write
-            assert stream.codec_context.is_open, "a video needs at least one image"
+            assert encoder.is_open, "a video needs at least one image"
             file.mux(stream.encode())
-
-
-def _set_up(encoder: VideoCodecContext) -> None:
-    """Colours as players expect them: BT.709 (code 1), limited range (code 1)."""
-    encoder.pix_fmt, encoder.options = "yuv420p", {"crf": str(QUALITY)}
-    encoder.colorspace = encoder.color_primaries = encoder.color_trc = encoder.color_range = 1
 
 
 def _even(image: Image) -> UInt8[np.ndarray, "even_h even_w 3"]:
@@ -120,15 +118,3 @@ def _even(image: Image) -> UInt8[np.ndarray, "even_h even_w 3"]:
     height, width, _ = image.shape
     rgb = np.broadcast_to(image, (height, width, 3))
     return np.pad(rgb, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def _expect_replaceable(path: Path) -> None:
-    if not path.exists():
-        return
-    if path.is_dir() and {p for p in path.iterdir()} <= set(list_images(path)):
-        return
-    raise OptionError(
-        "will not replace a folder that holds other files than images",
-        where=path,
-        do="choose another folder, or empty it",
-    )

@@ -85,12 +85,7 @@ class EventAgreement:
 def compare_events(
     predicted: EventStream, recorded: EventStream, edges_us: Sequence[int]
 ) -> EventAgreement:
-    """Compare two streams.
-
-    Args:
-        predicted: Rendered events.
-        recorded: Events of the real camera.
-        edges_us: Boundaries of the windows; only events within them count.
+    """Compare two streams; only events within `edges_us`, the boundaries of the windows, count.
 
     Raises:
         OptionError: The sensors differ in size, or nothing was recorded.
@@ -114,9 +109,7 @@ def compare_events(
         recorded=len(recorded),
         count_ratio=len(predicted) / len(recorded),
         pixel_correlation=float(np.corrcoef(*total)[0, 1]) if varied else math.nan,
-        count_error=float(
-            relative_count_error(*(torch.from_numpy(part).float() for part in counts))
-        ),
+        count_error=float(relative_count_error(*(torch.from_numpy(c).float() for c in counts))),
         sign_iou=float(same.sum() / either.sum()) if either.any() else math.nan,
         frame_psnr=_psnr(frames[0], frames[1]),
         empty_psnr=_psnr(np.zeros_like(frames[1]), frames[1]),
@@ -229,11 +222,7 @@ class ThresholdFactors:
 
     def applied(self, sensor: EventSensor) -> EventSensor:
         """A sensor with its thresholds multiplied by the factors."""
-        return replace(
-            sensor,
-            threshold_on=sensor.threshold_on * self.on,
-            threshold_off=sensor.threshold_off * self.off,
-        )
+        return _scaled(sensor, self.off, self.on)
 
 
 def match_thresholds(
@@ -327,14 +316,8 @@ def _fit(
     """Factors on the thresholds (darker, brighter), and the number of events without them."""
     factor, unmatched = np.ones(2), 0
     for number in range(ROUNDS):
-        scaled = replace(
-            sensor,
-            threshold_on=sensor.threshold_on * factor[1],
-            threshold_off=sensor.threshold_off * factor[0],
-        )
-        counts = sum(
-            (_count(timed, start_us, scaled) for start_us, timed in rendered), np.zeros(2, np.int64)
-        )
+        scaled = _scaled(sensor, factor[0], factor[1])
+        counts = np.sum([_count(timed, start_us, scaled) for start_us, timed in rendered], 0)
         unmatched = unmatched if number else int(counts.sum())
         ratio = np.maximum(counts, 1) / recorded
         if np.abs(ratio - 1).max() < TOLERANCE:
@@ -347,6 +330,11 @@ def _fit(
                 do="train it longer, or check the threshold that the capture states",
             )
     return factor, unmatched
+
+
+def _scaled(sensor: EventSensor, off: float, on: float) -> EventSensor:
+    thresholds = {"threshold_on": sensor.threshold_on * on}
+    return replace(sensor, **thresholds, threshold_off=sensor.threshold_off * off)
 
 
 def _count(timed: TimedImages, start_us: int, sensor: EventSensor) -> Int64[np.ndarray, "2"]:

@@ -126,8 +126,14 @@ def images(
     start, end = span_us
     if end <= start:
         raise OptionError("a time span must end after its start", got=f"{span_us} us")
+
+    def pixel_brightness(t_us: int) -> Float32[np.ndarray, "h w"]:
+        light = light_at(t_us)  # one channel of a monochrome model: [h, w]
+        single = light.ndim == 3 and light.shape[-1] == 1
+        return brightness(light[..., 0] if single else light, sensor.bayer)
+
     return watch(
-        lambda t_us: brightness(_without_single_channel(light_at(t_us)), sensor.bayer),
+        pixel_brightness,
         np.append(np.arange(start, end, time_steps.step_us, dtype=np.int64), end),
         most_change=time_steps.most_change * min(sensor.threshold_on, sensor.threshold_off),
         shortest_us=time_steps.shortest_us,
@@ -175,12 +181,7 @@ class Viewpoint:
 
 
 def track_viewpoint(model: Model, capture: Capture, track: int) -> Viewpoint:
-    """A camera of the capture, along its own path.
-
-    Args:
-        model: Trained.
-        capture: What it was trained on, as read.
-        track: Number of the camera.
+    """A camera of the capture that a model was trained on, along its own path.
 
     Raises:
         OptionError: There is no such camera.
@@ -191,8 +192,8 @@ def track_viewpoint(model: Model, capture: Capture, track: int) -> Viewpoint:
             "no such view", where=capture.name, got=track, do=f"use a number from 0 to {tracks - 1}"
         )
     clock = capture.clock
-    span = capture.trajectory.known_us(track)
-    span = span or (clock.origin_us, clock.origin_us + clock.span_us)
+    all_of_it = clock.origin_us, clock.origin_us + clock.span_us
+    span = capture.trajectory.known_us(track) or all_of_it
     return Viewpoint(model.capture.camera, model.capture.trajectory, track, span)
 
 
@@ -302,8 +303,3 @@ def _renderer(model: Any, camera: Camera) -> Any:
         got=f"{camera.width}x{camera.height}",
         do="leave the size as it was recorded",
     )
-
-
-def _without_single_channel(light: np.ndarray) -> np.ndarray:
-    """Three channels, or `[h, w]` where a monochrome model renders one channel."""
-    return light[..., 0] if light.ndim == 3 and light.shape[-1] == 1 else light

@@ -1,6 +1,5 @@
 """Output of rendered events: event files written window by window, event frames, comparisons."""
 
-import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,7 +13,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainin
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError, OptionError
 from sharpfield.core.events import EventStream, merged
-from sharpfield.core.files import replacing
+from sharpfield.core.files import write_json
 from sharpfield.core.progress import progress_on
 from sharpfield.recordings.open import open_recording
 from sharpfield.report.event_frames import count_events, writing_frames
@@ -142,7 +141,7 @@ def write_comparison(
     edges_us: list[int],
     about: dict[str, Any],
 ) -> None:
-    """Print the metrics of two streams; write them, and event frames of both, beside the events.
+    """Print the metrics of two streams; write them, and event frames of both, beside `out`.
 
     Args:
         console: Where to print.
@@ -156,8 +155,7 @@ def write_comparison(
         for name, value in asdict(compare_events(*streams, edges_us)).items()
     }
     table, image = (out.with_name(f"{out.stem}-compare.{end}") for end in ("json", "png"))
-    with replacing(table) as temporary:
-        temporary.write_text(json.dumps(found | about, indent=2, allow_nan=False) + "\n")
+    write_json(table, found | about, allow_nan=False)
     write_image(image, busiest_window(*streams, edges_us))
     for name, value in found.items():
         shown = "-" if value is None else f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
@@ -179,11 +177,7 @@ def render_progress(
     )
     with progress_on(console, *columns) as progress:
         task = progress.add_task("rendering", total=(span_us[1] - span_us[0]) / 1000)
-
-        def within_image(done: int, pixels: int) -> None:
-            progress.update(task, description=f"image {done / pixels:4.0%}")
-
-        def at_time(t_us: int) -> None:
-            progress.update(task, completed=(t_us - span_us[0]) / 1000)
-
-        yield within_image, at_time
+        yield (
+            lambda done, pixels: progress.update(task, description=f"image {done / pixels:4.0%}"),
+            lambda t_us: progress.update(task, completed=(t_us - span_us[0]) / 1000),
+        )

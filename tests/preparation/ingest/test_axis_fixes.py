@@ -65,4 +65,4 @@ def test_options_of_ingest_undo_fixes_of_a_text(tmp_path: Path) -> None:
         np.testing.assert_array_equal(
             getattr(found.needed_events, name), getattr(true, name), err_msg=name
         )
-    assert "x and y exchanged" in found.source
+    assert "x and y swapped" in found.source

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.preparation.poses.find_checks import advice, relief
+from sharpfield.preparation.poses.find import advice, relief
 from sharpfield.preparation.poses.mapping import SfmMap
 
 FOCAL_PX, VIEWS, POINTS = 180.0, 9, 240

@@ -74,10 +74,6 @@ class EventChange:
 def find_exposure_pairs(capture: Capture, *, most: int) -> list[ExposurePair]:
     """Pairs of consecutive exposures that are covered by events, spread over the capture.
 
-    Args:
-        capture: With frames and events.
-        most: Largest number of pairs.
-
     Raises:
         CaptureError: There are no events, or not two frames of one camera.
     """

@@ -6,7 +6,7 @@ every pixel (see `threshold_fit`). The uncertainty is a bootstrap over tiles of 
 Output of a calibration: thresholds, a map of the thresholds of all pixels, an image of it.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -94,11 +94,7 @@ class ThresholdCalibration:
 
 
 def calibrate(capture: Capture, options: CalibrateOptions) -> ThresholdCalibration:
-    """Measure thresholds.
-
-    Args:
-        capture: With frames and events of the same pixels; poses are not used.
-        options: Options.
+    """Measure thresholds from frames and events of the same pixels; poses are not used.
 
     Raises:
         CaptureError: Frames or events are missing, or too little changed.
@@ -175,15 +171,8 @@ def write_calibration(capture: Capture, found: ThresholdCalibration, out: Path) 
     about = calibration_summary(capture, found)
     write_json(out / NUMBERS, about)
     with replacing(out / PIXELS) as temporary:
-        write_arrays(
-            temporary,
-            {
-                "ratio": found.ratio,
-                "deviating": found.deviating,
-                "dead": found.dead,
-                "hot": found.hot,
-            },
-        )
+        maps = ("ratio", "deviating", "dead", "hot")
+        write_arrays(temporary, {name: getattr(found, name) for name in maps})
     write_image(out / IMAGE, pixel_image(found))
     return about
 
@@ -197,9 +186,7 @@ def calibration_summary(capture: Capture, found: ThresholdCalibration) -> dict[s
             "negative": _rounded(found.negative, found.negative_sigma),
             "positive": _rounded(found.positive, found.positive_sigma),
         },
-        "known": None
-        if known is None
-        else {"negative": known.negative, "positive": known.positive},
+        "known": None if known is None else asdict(known),
         "dead_us": round(found.dead_us, 1),
         "late_ms": round(found.late_ms, 2),
         "explained": round(found.explained, 4),

@@ -20,6 +20,7 @@ from sharpfield.preparation.calibrate.exposure_pairs import (
     find_exposure_pairs,
 )
 from sharpfield.preparation.doctor.findings import Checkup, MeasuredCurve
+from sharpfield.preparation.ingest.options import AxisFixes
 from sharpfield.report.colormaps import colour_signs
 
 PAIRS = 5
@@ -40,65 +41,8 @@ THRESHOLD = 0.2
 ignored."""
 
 
-@dataclass(frozen=True)
-class AxisConvention:
-    """How coordinates and polarity of the events would have to be changed."""
-
-    transposed: bool = False
-    mirrored_x: bool = False
-    mirrored_y: bool = False
-    flipped: bool = False
-    """Polarity."""
-
-    @property
-    def name(self) -> str:
-        """In words; empty if nothing is changed."""
-        parts = [
-            "x and y swapped" * self.transposed,
-            "x mirrored" * self.mirrored_x,
-            "y mirrored" * self.mirrored_y,
-            "polarity flipped" * self.flipped,
-        ]
-        return " and ".join(part for part in parts if part)
-
-    @property
-    def flags(self) -> str:
-        """The options of `sharpfield ingest` that correct it."""
-        # Mirrored after it was transposed, in the order in which `ingest` corrects it.
-        parts = [
-            "--swap-xy" * self.transposed,
-            "--flip-x" * self.mirrored_x,
-            "--flip-y" * self.mirrored_y,
-            "--flip-polarity" * self.flipped,
-        ]
-        return " ".join(part for part in parts if part)
-
-    def score(
-        self,
-        from_frames: Float64[np.ndarray, "n h w"],
-        from_events: Float64[np.ndarray, "n h w"],
-        usable: Bool[np.ndarray, "n h w"],
-    ) -> float:
-        """Correlation of the changes by frames with those by events in this convention."""
-        if self.transposed:
-            side = min(from_events.shape[1:])
-            from_events = from_events[:, :side, :side].swapaxes(1, 2)
-            from_frames, usable = from_frames[:, :side, :side], usable[:, :side, :side]
-        if self.mirrored_x:
-            from_events = from_events[:, :, ::-1]
-        if self.mirrored_y:
-            from_events = from_events[:, ::-1]
-        good = usable & ((from_events != 0) | (np.abs(from_frames) > THRESHOLD))
-        if good.sum() < 100 or from_events[good].std() == 0 or from_frames[good].std() == 0:
-            return 0.0
-        found = float(
-            np.corrcoef(np.clip(from_frames[good], -2, 2), np.clip(from_events[good], -2, 2))[0, 1]
-        )
-        return -found if self.flipped else found
-
-
-AS_IS = AxisConvention()
-CONVENTIONS = [AxisConvention(*parts) for parts in product((False, True), repeat=4)]
+AS_IS = AxisFixes()
+CONVENTIONS = [AxisFixes(*parts) for parts in product((False, True), repeat=4)]
 
 
 @dataclass(frozen=True)
@@ -107,7 +51,7 @@ class FrameEventAgreement:
 
     correlation: float
     """With the events as they are."""
-    best: AxisConvention
+    best: AxisFixes
     shift_us: int
     """Time shift of the frames with the best agreement."""
     best_correlation: float
@@ -123,12 +67,14 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
         return None
     index = build_index(capture.needed_events)
     pairs = find_exposure_pairs(capture, most=PAIRS)
-    from_frames = np.stack([_luma_change(pair) for pair in pairs])
+    from_frames = np.stack([pair.change.mean(-1) for pair in pairs])
     usable = np.stack([pair.usable.all(-1) for pair in pairs])  # [n, h, w]
+    for change, good in zip(from_frames, usable, strict=True):  # without the gain of the frame
+        change -= np.median(change[good]) if good.any() else 0.0
     shifts = np.arange(-MAX_SHIFT_US, MAX_SHIFT_US + 1, COARSE_US)
     scores = np.array(
         [
-            [one.score(from_frames, from_events, usable) for one in CONVENTIONS]
+            [_score(one, from_frames, from_events, usable) for one in CONVENTIONS]
             for from_events in (
                 _changes_by_events(capture, index, pairs, int(shift)) for shift in shifts
             )
@@ -141,7 +87,7 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
         best, at = AS_IS, int(scores[:, 0].argmax())
     fine = int(shifts[at]) + np.arange(-COARSE_US, COARSE_US + 1, FINE_US)
     finer = [
-        best.score(from_frames, _changes_by_events(capture, index, pairs, int(s)), usable)
+        _score(best, from_frames, _changes_by_events(capture, index, pairs, int(s)), usable)
         for s in fine
     ]
     column = CONVENTIONS.index(best)
@@ -168,6 +114,30 @@ def check_agreement(capture: Capture, checkup: Checkup) -> FrameEventAgreement |
     return found
 
 
+def _score(
+    fixes: AxisFixes,
+    from_frames: Float64[np.ndarray, "n h w"],
+    from_events: Float64[np.ndarray, "n h w"],
+    usable: Bool[np.ndarray, "n h w"],
+) -> float:
+    """Correlation of the changes by frames with those by events, once corrected."""
+    if fixes.swap_xy:
+        side = min(from_events.shape[1:])
+        from_events = from_events[:, :side, :side].swapaxes(1, 2)
+        from_frames, usable = from_frames[:, :side, :side], usable[:, :side, :side]
+    if fixes.flip_x:
+        from_events = from_events[:, :, ::-1]
+    if fixes.flip_y:
+        from_events = from_events[:, ::-1]
+    good = usable & ((from_events != 0) | (np.abs(from_frames) > THRESHOLD))
+    if good.sum() < 100 or from_events[good].std() == 0 or from_frames[good].std() == 0:
+        return 0.0
+    found = float(
+        np.corrcoef(np.clip(from_frames[good], -2, 2), np.clip(from_events[good], -2, 2))[0, 1]
+    )
+    return -found if fixes.flip_polarity else found
+
+
 def _add_findings(found: FrameEventAgreement, checkup: Checkup) -> None:
     shifted = (
         abs(found.shift_us) >= SHIFT_US and found.best_correlation > found.unshifted + SHIFT_GAIN
@@ -186,16 +156,17 @@ def _add_findings(found: FrameEventAgreement, checkup: Checkup) -> None:
     if found.best != AS_IS:
         name = (
             "polarity-flipped"
-            if found.best == AxisConvention(flipped=True)
+            if found.best == AxisFixes(flip_polarity=True)
             else "axes-swapped"
-            if found.best.transposed
+            if found.best.swap_xy
             else "mirrored"
         )
+        words = " and ".join(found.best.words)
         checkup.add(
             "error",
             name,
-            f"the events have {found.best.name}",
-            got=f"{better} {found.best.name}",
+            f"the events have {words}",
+            got=f"{better} {words}",
             do=f"ingest again with {found.best.flags}",
         )
     if shifted:
@@ -225,13 +196,6 @@ def _add_shift(found: FrameEventAgreement, better: str, checkup: Checkup) -> Non
         got=f"{better} frames {abs(late):.0f} ms {'earlier' if late > 0 else 'later'}",
         do=do,
     )
-
-
-def _luma_change(pair: ExposurePair) -> Float64[np.ndarray, "h w"]:
-    """Change of log luma between two exposures, without the gain of the frame (median)."""
-    change = pair.change.mean(-1)
-    usable = pair.usable.all(-1)
-    return change - (np.median(change[usable]) if usable.any() else 0.0)
 
 
 def _changes_by_events(

@@ -57,7 +57,8 @@ def examine(capture: Capture) -> Checkup:
         check_pixels(capture, checkup)
     agreed = False
     if aligned and in_time and capture.frames is not None and not checkup.has("error"):
-        agreed = _possible(checkup, "agreement", lambda: _agree(capture, checkup))
+        compared = _possible(checkup, "agreement", lambda: check_agreement(capture, checkup))
+        agreed = compared and not checkup.has("error")
     if agreed:
         capture = _with_thresholds(capture, checkup)
     posed = in_time and check_poses_known(capture, checkup)
@@ -84,11 +85,6 @@ def examine_path(path: Path, *, layout: str | None = None) -> tuple[Checkup, Cap
         checkup.add("error", (names or ["unreadable"])[0], error.what, got=got, do=error.do)
         return checkup, None
     return examine(capture), capture
-
-
-def _agree(capture: Capture, checkup: Checkup) -> bool:
-    found = check_agreement(capture, checkup)
-    return found is not None and not checkup.has("error")
 
 
 def _with_thresholds(capture: Capture, checkup: Checkup) -> Capture:
@@ -147,13 +143,7 @@ WIDE = 1.9
 
 
 def write_doctor_page(path: Path, checkup: Checkup, capture: Capture | None) -> None:
-    """Write the page.
-
-    Args:
-        path: The file.
-        checkup: Its findings and evidence.
-        capture: What was checked; None if it could not be read.
-    """
+    """Write the page of a checkup; the capture is None if it could not be read."""
     images = [
         CaptionedImage("evidence", np.ascontiguousarray(pixels), caption, caption.capitalize())
         for caption, pixels in checkup.images.items()

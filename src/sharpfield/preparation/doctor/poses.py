@@ -147,7 +147,12 @@ def check_blur(capture: Capture, checkup: Checkup) -> None:
     blurred = np.flatnonzero(~exposure.instant)
     if not len(blurred) or capture.trajectory.known_us(0) is None:
         return
-    length = np.array([_blur_px(capture, int(i)) for i in blurred])
+    length = np.array(
+        [
+            image_speed(capture, np.linspace(*exposure.window(int(i)), 9).round().astype(int)).sum()
+            for i in blurred
+        ]
+    )
     names = capture.needed_frames.names
     worst = int(length.argmax())
     got = f"most in {names[blurred[worst]]}: {length[worst]:.1f} px"
@@ -179,13 +184,6 @@ def image_speed(capture: Capture, edges_us: Int64[np.ndarray, "k"]) -> Float64[n
     then = (world - poses[1:, None, :, 3]) @ poses[1:, :, :3]
     moved = camera.project(torch.from_numpy(then)).numpy() - grid  # [n, 16, 2]
     return np.linalg.norm(moved, axis=-1).mean(-1)
-
-
-def _blur_px(capture: Capture, frame: int) -> float:
-    """Length of the image motion during an exposure, in px."""
-    opens, closes = capture.needed_frames.exposure.window(frame)
-    edges = np.linspace(opens, closes, 9).round().astype(np.int64)
-    return float(image_speed(capture, edges).sum())
 
 
 def _poses(capture: Capture, sharp: SfmImages) -> Float64[np.ndarray, "n 3 4"]:

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -158,15 +158,16 @@ class AxisFixes:
     flip_polarity: bool = False
     """Invert polarities."""
 
-    def __str__(self) -> str:
-        """The errors in words; empty if there are none."""
-        words = {
-            "x and y exchanged": self.swap_xy,
-            "x mirrored": self.flip_x,
-            "y mirrored": self.flip_y,
-            "polarity flipped": self.flip_polarity,
-        }
-        return ", ".join(word for word, wrong in words.items() if wrong)
+    @property
+    def words(self) -> list[str]:
+        """The errors in words."""
+        every = ("x and y swapped", "x mirrored", "y mirrored", "polarity flipped")
+        return [word for word, wrong in zip(every, astuple(self), strict=True) if wrong]
+
+    @property
+    def flags(self) -> str:
+        """The options of `sharpfield ingest` that correct them."""
+        return " ".join(f"--{n.replace('_', '-')}" for n, wrong in asdict(self).items() if wrong)
 
 
 def fixed_axes(recording: Recording, fixes: AxisFixes) -> Recording:
@@ -174,7 +175,7 @@ def fixed_axes(recording: Recording, fixes: AxisFixes) -> Recording:
 
     Where axes are exchanged, width and height of the sensor are exchanged as well.
     """
-    if not str(fixes) or recording.events is None:
+    if not fixes.words or recording.events is None:
         return recording
     opened, size = recording.events, recording.size
     if size is not None and fixes.swap_xy:
@@ -183,7 +184,7 @@ def fixed_axes(recording: Recording, fixes: AxisFixes) -> Recording:
     def events() -> Chunks:
         return (_fixed(chunk, fixes) for chunk in opened())
 
-    layout = f"{recording.layout} ({fixes})"
+    layout = f"{recording.layout} ({', '.join(fixes.words)})"
     return replace(recording, events=events, size=size, layout=layout)
 
 

@@ -17,7 +17,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +45,7 @@ PLAN = "plan.json"
 
 
 class StagingFolder:
-    """The staging folder.
-
-    Args:
-        out: Final path of the capture.
-        plan: Input files and options, as JSON values.
-        part: Events in a part.
+    """The staging folder of the capture at `out`; the plan is JSON values.
 
     Raises:
         CaptureError: `out` exists and is no capture, or the staging folder is not ours.
@@ -60,29 +55,25 @@ class StagingFolder:
         expect_replaceable(out, native.recognise)
         self._out, self._part = out, part
         self.folder = out.resolve().parent / f".{out.resolve().name}-ingest"
+        self.capture = self.folder / "capture"
+        """Folder of the capture in the making."""
+        self.frames_record = self.folder / "frames.json"
+        """The record of the frames."""
+        self.events_record = self.folder / "events.json"
+        """The counts of the events."""
         plan_file = self.folder / PLAN
         self.resumed = plan_file.is_file() and plan_file.read_text() == json.dumps(plan)
         if not self.resumed:
-            self._expect_own()
+            if self.folder.exists() and not plan_file.is_file():
+                raise CaptureError(
+                    "the staging folder exists and is not one of ours",
+                    where=self.folder,
+                    do="move that folder away",
+                )
             shutil.rmtree(self.folder, ignore_errors=True)
             self.capture.mkdir(parents=True)
             with replacing(plan_file) as temporary:
                 temporary.write_text(json.dumps(plan))
-
-    @property
-    def capture(self) -> Path:
-        """Folder of the capture in the making."""
-        return self.folder / "capture"
-
-    @property
-    def frames_record(self) -> Path:
-        """File with the record of the frames."""
-        return self.folder / "frames.json"
-
-    @property
-    def events_record(self) -> Path:
-        """File with the counts of the events."""
-        return self.folder / "events.json"
 
     def save_survey(self, survey: Survey) -> None:
         """Save the result of the first pass."""
@@ -152,14 +143,6 @@ class StagingFolder:
     def _parts(self) -> list[Path]:
         return sorted(self.folder.glob("part-*.h5"))
 
-    def _expect_own(self) -> None:
-        if self.folder.exists() and not (self.folder / PLAN).is_file():
-            raise CaptureError(
-                "the staging folder exists and is not one of ours",
-                where=self.folder,
-                do="move that folder away",
-            )
-
 
 def fingerprint(path: Path) -> list[Any]:
     """Path, number of files, bytes and time of the last change of a file or folder."""
@@ -222,13 +205,9 @@ class WrittenFrames:
 
     def selected(self, keep: Shaped[np.ndarray, "n"]) -> "WrittenFrames":
         """Some of the frames, without their changes."""
-        return WrittenFrames(
-            tuple(name for name, is_kept in zip(self.names, keep, strict=True) if is_kept),
-            self.open_us[keep],
-            self.close_us[keep],
-            np.empty(0),
-            self.shape,
-            self.bits,
+        names, opens, closes = np.array(self.names)[keep], self.open_us[keep], self.close_us[keep]
+        return replace(
+            self, names=tuple(names.tolist()), open_us=opens, close_us=closes, change=np.empty(0)
         )
 
 
@@ -287,15 +266,8 @@ def write_frames(
 
 def save_frames(frames: WrittenFrames, path: Path) -> None:
     """Save the record of all frames after the last one was written."""
-    record: dict[str, Any] = {
-        "names": frames.names,
-        "open_us": frames.open_us.tolist(),
-        "close_us": frames.close_us.tolist(),
-        "change": frames.change.tolist(),
-        "shape": frames.shape,
-        "bits": frames.bits,
-    }
-    write_json(path, record)
+    lists = {name: getattr(frames, name).tolist() for name in ("open_us", "close_us", "change")}
+    write_json(path, vars(frames) | lists)
 
 
 def load_frames(path: Path) -> WrittenFrames:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Int64
 from numba import njit
 
 from sharpfield.core.errors import CaptureError
@@ -50,13 +50,7 @@ class Survey:
 def survey_events(
     chunks: Chunks, size: tuple[int, int], where: object, progress: Callable[[int], None]
 ) -> Survey:
-    """Count all events, in bounded memory.
-
-    Args:
-        chunks: The events.
-        size: Sensor resolution, width and height.
-        where: The file, for messages.
-        progress: Called with the number of events so far.
+    """Count all events of a sensor of some width and height, in bounded memory.
 
     Raises:
         CaptureError: The recording is longer than a day.
@@ -137,11 +131,11 @@ class EventFilter:
         if len(self.hot):
             keep = ~self._removed_pixels[inside.y, inside.x]
             self.hot_pixel_events += int((~keep).sum())
-            inside = selected_events(inside, keep)
+            inside = inside[np.flatnonzero(keep)]
         if self.isolated_us:
             keep = _has_neighbour(inside.x, inside.y, inside.t_us, self.isolated_us, self._latest)
             self.isolated += int((~keep).sum())
-            inside = selected_events(inside, keep)
+            inside = inside[np.flatnonzero(keep)]
         return inside
 
     def left_out(self) -> dict[str, int]:
@@ -160,20 +154,6 @@ class EventFilter:
     def load_counts(self, counts: list[int]) -> None:
         """Set the counts of a filter that has already been applied."""
         self.hot_pixel_events, self.isolated, self.outside = counts
-
-
-def selected_events(events: EventStream, keep: Shaped[np.ndarray, "n"]) -> EventStream:
-    """Events of one camera by mask, copied."""
-    return EventStream(
-        x=events.x[keep],
-        y=events.y[keep],
-        t_us=events.t_us[keep],
-        p=events.p[keep],
-        width=events.width,
-        height=events.height,
-        bayer=events.bayer,
-        site_colour=events.site_colour,
-    )
 
 
 @njit(cache=True, nogil=True)

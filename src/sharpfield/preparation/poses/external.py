@@ -21,7 +21,6 @@ from sharpfield.geometry.two_views import depths_of, find_features, match_pairs,
 from sharpfield.preparation.poses.images import sfm_images
 from sharpfield.preparation.poses.path import (
     FramesOnPath,
-    KnownPoses,
     capture_on_path,
     frames_on_tracks,
     path_through,
@@ -87,7 +86,9 @@ def attach(
     return Attached(made, laid.kept, laid.path.known_us(0))
 
 
-def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"]) -> KnownPoses:
+def known_at(
+    path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"]
+) -> Float64[np.ndarray, "n 3 4"]:
     """Poses of the camera at some times of the capture; NaN outside the time of the file.
 
     Raises:
@@ -101,7 +102,7 @@ def known_at(path: ExternalPath, mount: Mount, times_us: Int64[np.ndarray, "n"])
     unit = torch.from_numpy(clock.unit(times_us))
     found = along.pose(unit, torch.zeros(len(unit), dtype=torch.int64)).numpy()
     outside = (times_us < stamps[0]) | (times_us > stamps[-1])
-    return KnownPoses(np.where(outside[:, None, None], np.nan, found))
+    return np.where(outside[:, None, None], np.nan, found)
 
 
 def _mounted(poses: Float64[np.ndarray, "p 3 4"], mount: Mount) -> Float64[np.ndarray, "p 3 4"]:
@@ -117,16 +118,10 @@ def _timed(
     """Everything that the path covers; there must be one camera."""
     assert path.times_us is not None, "checked by the caller"
     stamps = path.times_us + mount.offset_us
-    laid_path = Stamped(stamps, poses, capture.clock)
+    span, laid_path = (int(stamps[0]), int(stamps[-1])), Stamped(stamps, poses, capture.clock)
     frames = capture.frames
     if frames is None:
-        _expect_some(
-            capture,
-            stamps,
-            0
-            if capture.events is None
-            else int(np.diff(np.searchsorted(capture.events.t_us, (stamps[0], stamps[-1])))[0]),
-        )
+        _expect_some(capture, stamps, len(capture.needed_events.window(*span)))
         return FramesOnPath(None, laid_path, np.zeros(0, np.int64), np.zeros(1, np.int64))
     if len(np.unique(frames.track)) > 1:
         raise CaptureError(

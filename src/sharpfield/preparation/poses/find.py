@@ -4,19 +4,27 @@
 
 Frames without a pose between others stay in the capture, on the trajectory, but are neither trained
 on nor held out. Frames and events before the start or after the end of the trajectory are left out.
+
+In front of a plane, translation and rotation look nearly alike, and so do a long focal length from
+afar and a short one from nearby: a reconstruction of such a scene fits its images well and is still
+wrong. So the *relief*, the depth variation of the scene, is measured: the share of the points that
+two distant images share which depart from the best plane (homography) by more than the measurement
+error.
+
+Source: Hartley and Zisserman, *Multiple View Geometry* (2003), sections 11.9 and 13.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import CaptureError
-from sharpfield.geometry.space import Similarity
+from sharpfield.core.seed import evenly_spread
 from sharpfield.preparation.options import ImageSource, PoseOptions
-from sharpfield.preparation.poses.find_checks import Relief, relief
 from sharpfield.preparation.poses.images import SfmImages, sfm_images
 from sharpfield.preparation.poses.mapping import (
     MIN_FEATURES,
@@ -29,7 +37,6 @@ from sharpfield.preparation.poses.mapping import (
 )
 from sharpfield.preparation.poses.path import (
     FramesOnPath,
-    KnownPoses,
     PoseErrors,
     capture_on_path,
     centred_world,
@@ -38,6 +45,110 @@ from sharpfield.preparation.poses.path import (
     measured_world,
     path_through,
 )
+
+PAIRS = 12
+FAR = 0.75
+"""Quantile of the distances of image pairs that share points; only pairs farther apart are used."""
+SHARED = 20
+"""Two images must share so many points."""
+TOLERANCE, LEAST_PX = 3.0, 1.0
+"""A point is off a plane if its error is so many times that of the map, and so many px."""
+LEAST_OFF = 0.1
+"""Share of points off the plane below which the scene counts as flat."""
+
+
+@dataclass(frozen=True)
+class Relief:
+    """How much the points depart from a plane."""
+
+    off_plane: float
+    """Share of the shared points that are off the best plane; median over image pairs."""
+    tolerance_px: float
+    """Largest error of a point on the plane."""
+    thickness: float
+    """Median distance of the points from the best plane, over their median depth."""
+    pairs: int
+    """Number of image pairs."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether a plane explains nearly all points."""
+        return self.off_plane < LEAST_OFF
+
+
+def relief(found: SfmMap) -> Relief | None:
+    """Depth variation of a map; None if too few points are shared to measure it."""
+    pairs = _pairs_far_apart(found)
+    if not pairs:
+        return None
+    error_px = float(np.nanmean(found.error_px))
+    tolerance_px = max(TOLERANCE * error_px, LEAST_PX)
+    shares = [_off_plane(found, one, two, rows, tolerance_px) for one, two, rows in pairs]
+    return Relief(float(np.median(shares)), tolerance_px, _thickness(found), len(pairs))
+
+
+def advice(shown: Relief | None, intrinsics: Intrinsics) -> tuple[str, str] | None:
+    """Warning about poses of a flat scene, and what to try; None if the scene is not flat."""
+    if shown is None or not shown.flat:
+        return None
+    lens = intrinsics != "given"
+    warning = (
+        f"the scene is nearly flat: in distant images a plane explains"
+        f" {100 * (1 - shown.off_plane):.0f} % of the points to {shown.tolerance_px:.1f} px, and"
+        f" half of them are within {100 * shown.thickness:.1f} % of their depth from one plane;"
+        f" camera positions{' and the focal length' if lens else ''} may be off by a tenth"
+    )
+    known = "give the focal length (ingest with --calibration, then --intrinsics given); "
+    return warning, (
+        f"{known if lens else ''}refine poses in training (train ev-splat --preset refine); record"
+        " objects at other depths, and move farther sideways"
+    )
+
+
+def _pairs_far_apart(found: SfmMap) -> list[tuple[int, int, Int64[np.ndarray, "m"]]]:
+    """Pairs of distant images that share points, and the indices of these points."""
+    view, point = found.observations.T
+    good = found.track_length[point] >= VIEWS
+    shape = len(found.poses), len(found.points)
+    seen = np.zeros(shape, np.float32)
+    seen[view[good], point[good]] = 1
+    shared = np.triu(seen @ seen.T, 1) >= SHARED  # [n, n], each pair once
+    one, two = np.nonzero(shared)
+    if not len(one):
+        return []
+    centre = found.poses[:, :, 3]
+    apart = np.linalg.norm(centre[one] - centre[two], axis=-1)
+    far = np.flatnonzero(apart >= np.quantile(apart, FAR))
+    some = evenly_spread(far, PAIRS)
+    return [(int(one[i]), int(two[i]), np.flatnonzero(seen[one[i]] * seen[two[i]])) for i in some]
+
+
+def _off_plane(
+    found: SfmMap, one: int, two: int, rows: Int64[np.ndarray, "m"], tolerance_px: float
+) -> float:
+    """Share of points whose positions in two images the best homography does not relate."""
+    first, second = (
+        found.camera.fx_px * local[:, :2] / local[:, 2:]  # pinhole projections, undistorted
+        for pose in found.poses[[one, two]]
+        for local in ((found.points[rows] - pose[:, 3]) @ pose[:, :3],)
+    )
+    cv2.setRNGSeed(0)
+    _, explained = cv2.findHomography(first, second, cv2.RANSAC, tolerance_px)
+    return 1.0 if explained is None else 1 - float(explained.mean())
+
+
+def _thickness(found: SfmMap) -> float:
+    """Median distance from the plane fitted to the closest half of the points, over their depth."""
+    good = found.points[found.track_length >= VIEWS]
+    kept = np.ones(len(good), bool)
+    distance = np.zeros(len(good))
+    for _ in range(5):  # trimmed: a few objects in front of a wall do not tilt it
+        centre = good[kept].mean(0)
+        normal = np.linalg.svd(good[kept] - centre, full_matrices=False)[2][2]
+        distance = np.abs((good - centre) @ normal)
+        kept = distance <= np.median(distance)
+    return float(np.median(distance) / np.median(depths(found)))
+
 
 INSTANTS, MAX_IMAGES = 3, 120
 """Images of each exposure, fewer if there would be more than `MAX_IMAGES` in total."""
@@ -56,8 +167,8 @@ BOUNDS_MARGIN = 1.1
 """Near and far are these percentiles of the depth of all observations, with a margin."""
 
 
-KnownAt = Callable[[Int64[np.ndarray, "n"]], KnownPoses]
-"""Gives known poses at some times of the capture, in us."""
+KnownAt = Callable[[Int64[np.ndarray, "n"]], Float64[np.ndarray, "n 3 4"]]
+"""Gives known world-from-camera poses at some times of the capture, in us; NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +217,8 @@ def find_poses(
     images = sfm_images(
         capture, options.images, instants=options.instants or _instants(capture, options.images)
     )
-    intrinsics = options.intrinsics or _default_intrinsics(capture)
+    default = "find" if capture.known.intrinsics == "unknown" else "given"
+    intrinsics: Intrinsics = options.intrinsics or default
     task = LensTask(capture.camera, intrinsics, options.lens)
     found, counts = map_images(images.images, task, seed=options.seed)
     if found is None or found.registered.sum() < max(3, MIN_REGISTERED * len(images)):
@@ -118,7 +230,9 @@ def find_poses(
         change = measured_world(found, capture, images.frame)
     else:
         change = centred_world(found)
-    found = _transformed(found, change)
+    poses = found.poses.copy()
+    poses[found.registered] = change.poses(found.poses[found.registered])
+    found = replace(found, poses=poses, points=change.points(found.points))
     made, laid = _with_poses(capture, images, found, intrinsics)
     failures = tuple(
         Failure(int(i), *_why(int(i), images, counts)) for i in np.flatnonzero(~found.registered)
@@ -134,16 +248,6 @@ def _instants(capture: Capture, source: ImageSource) -> int:
     if capture.events is None or not blurred or source not in ("auto", "edi"):
         return 1
     return max(min(INSTANTS, MAX_IMAGES // blurred), 1)
-
-
-def _default_intrinsics(capture: Capture) -> Intrinsics:
-    return "find" if capture.known.intrinsics == "unknown" else "given"
-
-
-def _transformed(found: SfmMap, change: Similarity) -> SfmMap:
-    poses = found.poses.copy()
-    poses[found.registered] = change.poses(found.poses[found.registered])
-    return replace(found, poses=poses, points=change.points(found.points))
 
 
 def _with_poses(

@@ -4,10 +4,9 @@ The trajectory of a moving camera is a cubic spline through the poses found, wit
 rotation. It is extrapolated to the opening of the first shutter and the closing of the last one, at
 the speed of the nearest segment. Photos, each on a track of its own, have a constant pose.
 
-World coordinates of found poses: images determine them only up to a similarity.
-
-By default the average camera is at the origin and looks along z, and the median depth of the points
-is one. Measured depth gives a metric scale. KnownPoses positions define the world instead.
+Images determine world coordinates only up to a similarity. By default the average camera is at the
+origin and looks along z, and the median depth of the points is one. Measured depth gives a metric
+scale. Known poses define the world instead.
 """
 
 from dataclasses import dataclass, replace
@@ -41,12 +40,9 @@ def extrapolated(
     poses: Float64[np.ndarray, "p 3 4"],
     window_us: tuple[int, int],
 ) -> tuple[Int64[np.ndarray, "q"], Float64[np.ndarray, "q 3 4"]]:
-    """Poses with one more at either end, so that a window is covered as far as allowed.
+    """World-from-camera poses with one more at either end, to cover a window as far as allowed.
 
-    Args:
-        times_us: Ascending, at least two.
-        poses: World-from-camera.
-        window_us: Time span to cover.
+    There are at least two, in ascending order of time.
     """
     begin = max(window_us[0], int(times_us[0] - MAX_EXTRAPOLATION * (times_us[1] - times_us[0])))
     end = min(window_us[1], int(times_us[-1] + MAX_EXTRAPOLATION * (times_us[-1] - times_us[-2])))
@@ -79,23 +75,13 @@ def path_through(
     poses: Float64[np.ndarray, "n 3 4"],
     clock: Clock,
 ) -> FramesOnPath:
-    """The trajectory of all cameras.
-
-    Args:
-        frames: Frames of the capture.
-        frame: Index of the frame of each pose.
-        time_us: Instant of each pose.
-        poses: World-from-camera.
-        clock: Clock of the capture.
-    """
+    """The trajectory of all cameras, through the world-from-camera pose of each `frame` index."""
     moving, standing = list[Stamped](), list[int]()
     track_of = np.full(int(frames.track.max()) + 1, -1)
     on_path = np.zeros(len(frames), bool)
     for one in moving_tracks(frames):
-        own, member = (
-            np.flatnonzero(frames.track[frame] == one),
-            np.flatnonzero(frames.track == one),
-        )
+        own = np.flatnonzero(frames.track[frame] == one)
+        member = np.flatnonzero(frames.track == one)
         times, first = np.unique(time_us[own], return_index=True)
         if len(times) < 2:
             continue
@@ -131,12 +117,13 @@ def capture_on_path(
         laid: The trajectory, and the frames on it.
         without: Frames whose pose is unsure: neither trained on nor held out.
     """
-    depth = capture.depth
+    depth, parts = capture.depth, (capture.split.train, capture.split.test)
+    sure = ~np.isin(laid.kept, np.zeros(0, int) if without is None else without)
     return replace(
         capture,
         trajectory=laid.path,
         frames=laid.frames,
-        split=_split_of(capture.split, laid.kept, np.zeros(0, int) if without is None else without),
+        split=Split(*(np.flatnonzero(sure & np.isin(laid.kept, part)) for part in parts)),
         depth=None if depth is None else replace(depth, stored=depth.stored[laid.kept]),
         events=_events_on_path(capture.events, laid),
         test_events=_events_on_path(capture.test_events, laid),
@@ -150,28 +137,12 @@ def _events_on_path(events: EventStream | None, laid: FramesOnPath) -> EventStre
     if events.track is not None:
         track = laid.track_of[np.asarray(events.track, np.int64)]
         there = np.flatnonzero(track >= 0)
-        events = replace(
-            events,
-            x=events.x[there],
-            y=events.y[there],
-            t_us=events.t_us[there],
-            p=events.p[there],
-            track=track[there].astype(np.uint16),
-            tracks=int(laid.track_of.max()) + 1,
-        )
+        renumbered, tracks = track[there].astype(np.uint16), int(laid.track_of.max()) + 1
+        events = replace(events[there], track=renumbered, tracks=tracks)
     spans = [span for t in range(events.tracks) if (span := laid.path.known_us(t)) is not None]
     if not spans:
         return events
     return events.window(min(s[0] for s in spans), max(s[1] for s in spans) + 1)
-
-
-def _split_of(split: Split, kept: Int64[np.ndarray, "m"], unsure: Int64[np.ndarray, "u"]) -> Split:
-    """A split in the indices of the kept frames, without frames whose pose is unsure."""
-    sure = ~np.isin(kept, unsure)
-    return Split(
-        train=np.flatnonzero(sure & np.isin(kept, split.train)),
-        test=np.flatnonzero(sure & np.isin(kept, split.test)),
-    )
 
 
 def _beyond(
@@ -216,14 +187,6 @@ class PoseErrors:
     """Relative pose error, from image to image."""
 
 
-@dataclass(frozen=True)
-class KnownPoses:
-    """KnownPoses poses at the instants of the images."""
-
-    poses: Float64[np.ndarray, "n 3 4"]
-    """World-from-camera; NaN where unknown."""
-
-
 def centred_world(found: SfmMap) -> Similarity:
     """Average camera at the origin, median depth of the points 1."""
     centre = average_pose(found.poses[found.registered])
@@ -255,23 +218,22 @@ def measured_world(found: SfmMap, capture: Capture, frame: Int64[np.ndarray, "n"
     return Similarity(base.scale * factor, base.rotation, base.translation * factor)
 
 
-def known_world(found: SfmMap, known: KnownPoses) -> tuple[Similarity, PoseErrors]:
-    """The similarity to the world of known poses, and the remaining differences.
-
-    Returns:
-        The similarity, and the absolute trajectory error and relative pose error (RMS).
+def known_world(
+    found: SfmMap, known: Float64[np.ndarray, "n 3 4"]
+) -> tuple[Similarity, PoseErrors]:
+    """The similarity to the world of known poses (NaN where unknown), and the errors left (RMS).
 
     Raises:
         CaptureError: Fewer than three images have both poses.
     """
-    both = found.registered & np.isfinite(known.poses).all((1, 2))
+    both = found.registered & np.isfinite(known).all((1, 2))
     if both.sum() < 3:
         raise CaptureError(
             "too few images have a pose in the file to align to",
             got=f"{both.sum()}, at least 3 are needed",
             do="check the clock of the file: --offset-ms moves it",
         )
-    estimate, truth = (torch.from_numpy(poses[both]) for poses in (found.poses, known.poses))
+    estimate, truth = (torch.from_numpy(poses[both]) for poses in (found.poses, known))
     change = align(estimate, truth)
     similarity = Similarity(change.scale, change.rotation.numpy(), change.translation.numpy())
     return similarity, PoseErrors(absolute_error(estimate, truth), relative_error(estimate, truth))

@@ -11,8 +11,8 @@ from jaxtyping import UInt8
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.seed import evenly_spread
-from sharpfield.preparation.poses.find import PosesFound
-from sharpfield.preparation.poses.find_checks import advice
+from sharpfield.preparation.poses.find import PosesFound, advice
+from sharpfield.report.colormaps import stored_as_bytes
 from sharpfield.report.figures import trajectory_figure
 from sharpfield.report.page import (
     CaptionedImage,
@@ -31,14 +31,12 @@ def poses_summary(original: Capture, found: PosesFound) -> dict[str, Any]:
     made, images, mapped = found.capture, found.images, found.map
     there = mapped.registered
     camera = made.camera
-    known = None if images.found is None else images.found.thresholds
+    known = None if images.found is None else asdict(images.found.thresholds)
     names, errors = original.needed_frames.names, found.errors
     return {
         "capture": original.name,
         "images_from": images.source,
-        "thresholds": None
-        if known is None
-        else {"negative": known.negative, "positive": known.positive},
+        "thresholds": known,
         "images": len(images),
         "registered": int(there.sum()),
         "frames": {
@@ -153,14 +151,7 @@ IMAGE_SOURCES = {
 def write_poses_page(
     path: Path, original: Capture, found: PosesFound, about: dict[str, Any]
 ) -> None:
-    """Write the page.
-
-    Args:
-        path: The file.
-        original: The capture before.
-        found: Poses, points and failures.
-        about: The summary of `found`.
-    """
+    """Write the page; `about` is the summary of what was found for the original capture."""
     relief = about["relief"]
     flat = None
     if relief is not None and relief["flat"]:
@@ -227,7 +218,7 @@ def _images(about: dict[str, Any]) -> TextTable:
 def _view(original: Capture, found: PosesFound, image: int) -> ComparedView:
     frames, frame = original.needed_frames, int(found.images.frame[image])
     name = frames.names[frame]
-    recorded = np.rint(np.asarray(frames.images[frame], np.float64) * (255 / frames.white))
+    recorded = _enlarged(stored_as_bytes(frames.images[frame]))
     caption = (
         f"{name}, used: {found.map.error_px[image]:.2f} px"
         if found.map.registered[image]
@@ -236,9 +227,7 @@ def _view(original: Capture, found: PosesFound, image: int) -> ComparedView:
     return ComparedView(
         f"{name} ({image})",
         (
-            CaptionedImage(
-                "recorded", _enlarged(recorded.astype(np.uint8)), name, f"{name} as recorded"
-            ),
+            CaptionedImage("recorded", recorded, name, f"{name} as recorded"),
             CaptionedImage("used", _marked(found, image), caption, f"{name} with its points"),
         ),
     )
