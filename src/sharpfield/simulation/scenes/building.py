@@ -1,18 +1,17 @@
-"""Constructors of surfaces, and the assembly of scenes for a camera that looks along +z.
+"""Surfaces, the bodies they move with, and the assembly of scenes.
 
 World axes are OpenCV's (x right, y down, z away), so the floor lies at positive y.
 
-Moving bodies: groups of surfaces with a common motion in closed form.
-
-A body's motion is an affine map from its own axes at rest to the world, as a function of time: a
-rotation and a translation for rigid bodies, with stretch and shear for deforming ones. Textures are
-fixed to the body, so they are stretched with it. Body 0 is static.
+A *body* is a group of surfaces with a common motion in closed form: an affine map from its own axes
+at rest to the world, as a function of time. That is a rotation and a translation for rigid bodies,
+with stretch and shear for deforming ones. Textures are fixed to the body, so they are stretched
+with it. Body 0 is static.
 
 A ball stays a ball, scaled by the mean stretch of its body; other surfaces are deformed exactly.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -34,8 +33,13 @@ Real = float | int
 """Whole numbers may be written without a point; checks at run time tell the two apart."""
 Vector = tuple[Real, Real, Real]
 
+Sway = tuple[Real, Real, Real, Real]
+"""How far a centre swings (x, y, z), and the period in seconds."""
+
 FLAT: Vector = (90.0, 0.0, 0.0)
 """Lays a rectangle down: a floor."""
+UPRIGHT: Vector = (0.0, 0.0, 0.0)
+AT_REST: Sway = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -63,62 +67,42 @@ class Surface:
     centre: Vector
     half: Vector
     paint: Paint
-    turn: Vector = (0.0, 0.0, 0.0)
+    turn: Vector = UPRIGHT
     """Pitch about x, yaw about y, roll about z, in degrees."""
     throws_shadow: bool = True
-    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0)
-    """How far the centre swings (x, y, z), and the period in seconds."""
+    sway: Sway = AT_REST
 
 
 def rectangle(
-    centre: Vector,
-    size: tuple[Real, Real],
-    paint: Paint,
-    *,
-    turn: Vector = (0.0, 0.0, 0.0),
-    throws_shadow: bool = True,
+    centre: Vector, size: tuple[Real, Real], paint: Paint, *, turn: Vector = UPRIGHT
 ) -> Surface:
     """A flat image of `size` (width, height), upright and facing the camera unless turned."""
-    half = (size[0] / 2, size[1] / 2, 0.0)
-    return Surface(RECTANGLE, centre, half, paint, turn, throws_shadow)
+    return Surface(RECTANGLE, centre, (size[0] / 2, size[1] / 2, 0.0), paint, turn)
 
 
-def ball(
-    centre: Vector,
-    radius: Real,
-    paint: Paint,
-    *,
-    turn: Vector = (0.0, 0.0, 0.0),
-    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
+def wall(
+    centre: Vector, size: tuple[Real, Real], paint: Paint, *, turn: Vector = UPRIGHT
 ) -> Surface:
+    """A rectangle that throws no shadow: a wall, a floor, or what lies flat on one."""
+    return replace(rectangle(centre, size, paint, turn=turn), throws_shadow=False)
+
+
+def ball(centre: Vector, radius: Real, paint: Paint, *, sway: Sway = AT_REST) -> Surface:
     """A ball."""
-    return Surface(BALL, centre, (radius, radius, radius), paint, turn, sway=sway)
+    return Surface(BALL, centre, (radius, radius, radius), paint, sway=sway)
 
 
 def box(
-    centre: Vector,
-    size: Vector,
-    paint: Paint,
-    *,
-    turn: Vector = (0.0, 0.0, 0.0),
-    sway: tuple[Real, Real, Real, Real] = (0.0, 0.0, 0.0, 1.0),
+    centre: Vector, size: Vector, paint: Paint, *, turn: Vector = UPRIGHT, sway: Sway = AT_REST
 ) -> Surface:
     """A box of `size` (width, height, depth)."""
     half = (size[0] / 2, size[1] / 2, size[2] / 2)
     return Surface(BOX, centre, half, paint, turn, sway=sway)
 
 
-def cylinder(
-    centre: Vector,
-    radius: Real,
-    height: Real,
-    paint: Paint,
-    *,
-    turn: Vector = (0.0, 0.0, 0.0),
-    throws_shadow: bool = True,
-) -> Surface:
+def cylinder(centre: Vector, radius: Real, height: Real, paint: Paint) -> Surface:
     """An upright cylinder, closed at both ends."""
-    return Surface(CYLINDER, centre, (radius, height / 2, radius), paint, turn, throws_shadow)
+    return Surface(CYLINDER, centre, (radius, height / 2, radius), paint)
 
 
 def build(
@@ -142,9 +126,10 @@ def build(
     pages = np.zeros((max(len(sheets), 1), rows, columns), np.float32)
     for pane, sheet in zip(pages, sheets, strict=False):
         pane[: sheet.shape[0], : sheet.shape[1]] = sheet
+    reach = [p.half[0] if p.kind == BALL else np.linalg.norm(p.half) for p in parts]
     shape = [
-        (p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow, _reach(p))
-        for p in parts
+        (p.kind, *p.centre, *p.half, *_axes(p.turn).ravel(), p.throws_shadow, far)
+        for p, far in zip(parts, reach, strict=True)
     ]
     look, which = [], 0
     for part in parts:
@@ -170,11 +155,6 @@ def linear(colour: str) -> Float64[np.ndarray, "3"]:
     """Linear RGB of a display colour written as #rrggbb (gamma 2.2)."""
     display = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     return np.array(display) ** 2.2
-
-
-def _reach(part: Surface) -> float:
-    """How far a surface goes from its centre."""
-    return float(part.half[0]) if part.kind == BALL else float(np.linalg.norm(part.half))
 
 
 def _axes(turn: Vector) -> Float64[np.ndarray, "3 3"]:

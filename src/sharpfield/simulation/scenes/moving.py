@@ -38,13 +38,11 @@ SUN = (-0.4, -0.6, 0.9)
 GREY = ("#565c66", "#565c66")
 TURN = 2 * np.pi
 
+CRATE = Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)
 TABLE: list[Part] = [
     (0, box((0, 0, -1.1), (2.2, 2.2, 0.2), Paint("#efe3cc", "#2d6a8e", "#d98c3f", TILES, 1.4))),
     (0, ball((-0.85, -0.8, -0.82), 0.18, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 6, 21))),
-    (
-        0,
-        box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), Paint("#f2c14e", "#2d4b73", "#f7ead2", BRICKS, 6)),
-    ),
+    (0, box((0.85, 0.8, -0.85), (0.3, 0.3, 0.3), CRATE)),
 ]
 """Static parts of some scenes."""
 
@@ -72,6 +70,7 @@ def _spinner() -> Moving:
     """Rigid: a rotor with three painted arms that turns, sways and bobs."""
     hub = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 2.3)
     rod = Paint("#9a6b41", "#d9ab78", texture=WOOD, cells=5, seed=4)
+    end = Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 5)
     parts = [
         *TABLE,
         (1, box((0, 0, 0), (0.46, 0.46, 0.7), hub)),
@@ -79,14 +78,7 @@ def _spinner() -> Moving:
         (1, box((-0.42, 0, -0.15), (0.84, 0.12, 0.12), rod)),
         (1, box((0, 0.4, 0.2), (0.12, 0.8, 0.12), rod)),
         (1, ball((0.9, 0, 0.1), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5))),
-        (
-            1,
-            box(
-                (-0.82, 0, -0.15),
-                (0.3, 0.3, 0.3),
-                Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 5),
-            ),
-        ),
+        (1, box((-0.82, 0, -0.15), (0.3, 0.3, 0.3), end)),
         (1, ball((0, 0.78, 0.2), 0.17, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 4, 5))),
     ]
 
@@ -102,41 +94,21 @@ def _arm() -> Moving:
     """Articulated: a robot arm of four joints whose gripper opens and closes."""
     steel = Paint("#d7dde4", "#5b6b7c", "#f2b134", STRIPES, 6, slant=0.5)
     limb = Paint("#e8743b", "#5c1f12", "#f9e0b8", BRICKS, 4.5)
+    foot = Paint("#efe9dc", "#2f6f6a", texture=CHECKS, cells=5)
+    forearm = Paint("#f3ead8", "#7b1e3a", "#2e7d58", TILES, 4)
+    left = Paint("#f4d06f", "#8f2d56", texture=STRIPES, cells=8)
+    right = Paint("#7fb069", "#24476b", texture=STRIPES, cells=8)
     parts = [
         *TABLE,
-        (
-            0,
-            box(
-                (0, 0, -0.92),
-                (0.62, 0.62, 0.16),
-                Paint("#efe9dc", "#2f6f6a", texture=CHECKS, cells=5),
-            ),
-        ),
+        (0, box((0, 0, -0.92), (0.62, 0.62, 0.16), foot)),
         (1, box((0, 0, 0.14), (0.46, 0.46, 0.28), steel)),
         (2, ball((0, 0, 0), 0.22, Paint("#f5f0e6", "#2456a6", texture=CHECKS, cells=5))),
         (2, box((0, 0, 0.36), (0.28, 0.3, 0.72), limb)),
         (3, ball((0, 0, 0), 0.2, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5.5))),
-        (
-            3,
-            box((0, 0, 0.28), (0.23, 0.25, 0.56), Paint("#f3ead8", "#7b1e3a", "#2e7d58", TILES, 4)),
-        ),
+        (3, box((0, 0, 0.28), (0.23, 0.25, 0.56), forearm)),
         (4, box((0, 0, 0.07), (0.4, 0.2, 0.12), steel)),
-        (
-            5,
-            box(
-                (0, 0, 0.1),
-                (0.1, 0.18, 0.26),
-                Paint("#f4d06f", "#8f2d56", texture=STRIPES, cells=8),
-            ),
-        ),
-        (
-            6,
-            box(
-                (0, 0, 0.1),
-                (0.1, 0.18, 0.26),
-                Paint("#7fb069", "#24476b", texture=STRIPES, cells=8),
-            ),
-        ),
+        (5, box((0, 0, 0.1), (0.1, 0.18, 0.26), left)),
+        (6, box((0, 0, 0.1), (0.1, 0.18, 0.26), right)),
     ]
 
     def maps(t: float) -> list[Map]:
@@ -232,33 +204,21 @@ def _puppet() -> Moving:
     def maps(t: float) -> list[Map]:
         sway = 0.35 * np.sin(TURN * 0.8 * t)
         body = placed((0, 0.14 * np.sin(TURN * 0.9 * t), 0.1), yaw=1.3 * t - 0.5, roll=sway)
+        arms, legs = np.sin(TURN * 0.9 * t + 0.5), np.sin(TURN * 0.9 * t + 0.2)
         shoulders = [
-            after(
-                body,
-                placed(
-                    (0, side * 0.45, 0.4),
-                    pitch=-0.8 - side * 0.9 * np.sin(TURN * 0.9 * t + 0.5),
-                    roll=side * 0.3,
-                ),
-            )
+            placed((0, side * 0.45, 0.4), pitch=-0.8 - side * 0.9 * arms, roll=side * 0.3)
             for side in (-1, 1)
         ]
+        shoulders = [after(body, shoulder) for shoulder in shoulders]
         elbows = [
             after(shoulder, placed((0, 0, -0.46), pitch=-0.7 - 0.6 * np.sin(TURN * t + k)))
             for k, shoulder in enumerate(shoulders)
         ]
         hips = [
-            after(
-                body,
-                placed(
-                    (0, side * 0.19, -0.26),
-                    pitch=side * 0.7 * np.sin(TURN * 0.9 * t + 0.2),
-                    roll=side * 0.1,
-                ),
-            )
+            placed((0, side * 0.19, -0.26), pitch=side * 0.7 * legs, roll=side * 0.1)
             for side in (-1, 1)
         ]
-        return [body, *shoulders, *elbows, *hips]
+        return [body, *shoulders, *elbows, *(after(body, hip) for hip in hips)]
 
     return parts, maps
 
@@ -266,10 +226,5 @@ def _puppet() -> Moving:
 ALONE: dict[str, Callable[[], Moving]] = {"glider": _glider, "puppet": _puppet}
 """Scenes without static parts."""
 
-MOVING_SCENES: dict[str, Callable[[], Moving]] = {
-    "spinner": _spinner,
-    "arm": _arm,
-    "jelly": _jelly,
-    **ALONE,
-}
+MOVING_SCENES = {"spinner": _spinner, "arm": _arm, "jelly": _jelly, **ALONE}
 """Scenes by name."""

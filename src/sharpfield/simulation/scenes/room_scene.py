@@ -13,7 +13,7 @@ from sharpfield.simulation.scenes.building import (
     box,
     build,
     cylinder,
-    rectangle,
+    wall,
 )
 from sharpfield.simulation.scenes.static import Scene
 from sharpfield.simulation.scenes.textures import (
@@ -59,22 +59,12 @@ def _shell() -> list[Surface]:
     floor = Paint("#8a5a34", "#b98552", texture=WOOD, cells=2.2, seed=3)
     ceiling = Paint("#f1eee6", "#dcd6c8", "#cfc4ae", TILES, 1.6, 7)
     walls = [
-        rectangle((0, middle, ROOM[1] / 2), (width, height), brick, throws_shadow=False),
-        rectangle(
-            (0, middle, -ROOM[1] / 2), (width, height), paper, turn=(0, 180, 0), throws_shadow=False
-        ),
-        rectangle(
-            (ROOM[0] / 2, middle, 0), (depth, height), plaster, turn=(0, 90, 0), throws_shadow=False
-        ),
-        rectangle(
-            (-ROOM[0] / 2, middle, 0),
-            (depth, height),
-            stripes,
-            turn=(0, -90, 0),
-            throws_shadow=False,
-        ),
-        rectangle((0, FLOOR, 0), (width, depth), floor, turn=FLAT, throws_shadow=False),
-        rectangle((0, CEILING, 0), (width, depth), ceiling, turn=FLAT, throws_shadow=False),
+        wall((0, middle, ROOM[1] / 2), (width, height), brick),
+        wall((0, middle, -ROOM[1] / 2), (width, height), paper, turn=(0, 180, 0)),
+        wall((ROOM[0] / 2, middle, 0), (depth, height), plaster, turn=(0, 90, 0)),
+        wall((-ROOM[0] / 2, middle, 0), (depth, height), stripes, turn=(0, -90, 0)),
+        wall((0, FLOOR, 0), (width, depth), floor, turn=FLAT),
+        wall((0, CEILING, 0), (width, depth), ceiling, turn=FLAT),
     ]
     rug = Paint("#7d2f3a", "#e8c98f", "#2d4b73", TILES, 1.9, 2)
     poster = Paint("#24476b", "#f6e7b4", text="LIGHT\nAND\nTIME")
@@ -83,12 +73,12 @@ def _shell() -> list[Surface]:
     leaves = Paint("#1f4d2b", "#86b94e", "#e5d36b", LEAVES, 6.0, 3)
     door = Paint("#6f4a2d", "#8f6844", texture=WOOD, cells=3.0, seed=8)
     hung = [
-        rectangle((0, FLOOR - 0.005, 0.05), (3.0, 2.2), rug, turn=FLAT, throws_shadow=False),
-        rectangle((-0.2, -0.25, 2.46), (1.3, 1.0), poster, throws_shadow=False),
-        rectangle((1.9, -0.2, -2.46), (1.2, 0.8), sign, turn=(0, 180, 0), throws_shadow=False),
-        rectangle((2.96, -0.15, -0.3), (1.0, 1.1), image, turn=(0, 90, 0), throws_shadow=False),
-        rectangle((-2.96, -0.2, 0.3), (1.2, 1.0), leaves, turn=(0, -90, 0), throws_shadow=False),
-        rectangle((0.3, 0.45, -2.47), (0.9, 2.1), door, turn=(0, 180, 0), throws_shadow=False),
+        wall((0, FLOOR - 0.005, 0.05), (3.0, 2.2), rug, turn=FLAT),
+        wall((-0.2, -0.25, 2.46), (1.3, 1.0), poster),
+        wall((1.9, -0.2, -2.46), (1.2, 0.8), sign, turn=(0, 180, 0)),
+        wall((2.96, -0.15, -0.3), (1.0, 1.1), image, turn=(0, 90, 0)),
+        wall((-2.96, -0.2, 0.3), (1.2, 1.0), leaves, turn=(0, -90, 0)),
+        wall((0.3, 0.45, -2.47), (0.9, 2.1), door, turn=(0, 180, 0)),
     ]
     return walls + hung
 
@@ -96,6 +86,7 @@ def _shell() -> list[Surface]:
 def _table() -> list[Surface]:
     """A round table with things on it, in the middle."""
     wood = Paint("#a8743f", "#d6a86a", texture=WOOD, cells=4.0, seed=1)
+    book = Paint("#1f5f8b", "#f2f2e9", text="RAYS")
     return [
         cylinder((0, 0.78, 0), 0.55, 0.06, wood),
         cylinder((0, 1.15, 0), 0.07, 0.7, wood),
@@ -103,12 +94,7 @@ def _table() -> list[Surface]:
         cylinder((-0.22, 0.62, 0.12), 0.1, 0.26, Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 14)),
         ball((-0.22, 0.42, 0.12), 0.17, Paint("#2f7a3d", "#9fce5a", "#f0a7c0", LEAVES, 13, 8)),
         box((0.2, 0.7, -0.1), (0.26, 0.1, 0.18), Paint("#b3263a", "#f6e7c1", text="FIELDS")),
-        box(
-            (0.22, 0.62, -0.09),
-            (0.22, 0.06, 0.16),
-            Paint("#1f5f8b", "#f2f2e9", text="RAYS"),
-            turn=(0, 25, 0),
-        ),
+        box((0.22, 0.62, -0.09), (0.22, 0.06, 0.16), book, turn=(0, 25, 0)),
         ball((0.12, 0.66, 0.28), 0.09, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=22)),
     ]
 
@@ -146,17 +132,13 @@ def _shelf() -> list[Surface]:
 def _sofa() -> list[Surface]:
     """A sofa with cushions, along the left wall."""
     cloth = Paint("#3d5f6f", "#5d8796", "#e9e2cf", TILES, 5.5, 6)
+    cushion = Paint("#f2c14e", "#2d4b73", "#f7ead2", STRIPES, 16, slant=0.6)
     return [
         box((-2.5, 1.2, 0.3), (0.8, 0.4, 2.0), cloth),
         box((-2.82, 0.85, 0.3), (0.25, 0.7, 2.0), cloth),
         box((-2.5, 1.02, -0.82), (0.8, 0.55, 0.25), cloth),
         box((-2.5, 1.02, 1.42), (0.8, 0.55, 0.25), cloth),
-        box(
-            (-2.55, 0.82, 0.85),
-            (0.16, 0.42, 0.42),
-            Paint("#f2c14e", "#2d4b73", "#f7ead2", STRIPES, 16, slant=0.6),
-            turn=(0, 12, 18),
-        ),
+        box((-2.55, 0.82, 0.85), (0.16, 0.42, 0.42), cushion, turn=(0, 12, 18)),
         ball((-2.45, 0.83, -0.2), 0.2, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 12, 21)),
     ]
 
@@ -166,16 +148,12 @@ def _desk() -> list[Surface]:
     wood = Paint("#7c5637", "#a97c50", texture=WOOD, cells=3.4, seed=9)
     metal = Paint("#c9ced6", "#6f7a8a", texture=STRIPES, cells=24)
     seat = Paint("#b0273a", "#f3ead8", texture=CHECKS, cells=9)
+    screen = Paint("#14203a", "#7fd1ff", text="60 FPS")
     legs = [cylinder((x, 1.15, z), 0.035, 0.7, metal) for x in (2.3, 2.9) for z in (-0.95, 0.55)]
     return [
         box((2.6, 0.77, -0.2), (0.75, 0.06, 1.7), wood),
         *legs,
-        box(
-            (2.72, 0.45, -0.2),
-            (0.75, 0.48, 0.05),
-            Paint("#14203a", "#7fd1ff", text="60 FPS"),
-            turn=(0, 90, 0),
-        ),
+        box((2.72, 0.45, -0.2), (0.75, 0.48, 0.05), screen, turn=(0, 90, 0)),
         cylinder((2.72, 0.72, -0.2), 0.1, 0.05, metal),
         cylinder((2.65, 0.58, 0.42), 0.025, 0.34, metal),
         ball((2.65, 0.36, 0.42), 0.13, Paint("#f7ead2", "#e2a33c", texture=CHECKS, cells=13)),

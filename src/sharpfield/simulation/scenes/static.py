@@ -5,7 +5,6 @@ unit sideways; surfaces are at distances of about 2 to 7. Fine detail (letters, 
 tiles) is there to be destroyed by blur and found again.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +20,7 @@ from sharpfield.simulation.scenes.building import (
     box,
     build,
     rectangle,
+    wall,
 )
 from sharpfield.simulation.scenes.surfaces import Surfaces, trace
 from sharpfield.simulation.scenes.textures import (
@@ -116,50 +116,25 @@ Parts = tuple[list[Surface], float, float, float]
 def _garden() -> Parts:
     """A patio: hedge, brick wall, painted tiles, pots and a sign."""
     azulejo = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 3.2)
+    hedge = Paint("#1f4d2b", "#86b94e", "#e5d36b", LEAVES, 2.6, 3)
+    floor = Paint("#d9b99b", "#8c3f2d", "#efe3cf", TILES, 1.0, 2)
+    brick = Paint("#b5573f", "#d98d62", "#e8dccb", BRICKS, 2.2)
+    sign = Paint("#fff6e0", "#b0273a", text="SHARP\nFIELD")
+    post = Paint("#6b4a2f", "#8f6844", texture=WOOD, cells=4)
+    chest = Paint("#f2c14e", "#2d4b73", "#f7ead2", STRIPES, 9.0, slant=0.6)
+    hours = Paint("#24476b", "#f6e7b4", text="OPEN\n24 h")
     parts = [
-        rectangle(
-            (0, -1.95, 7.0),
-            (16, 6.5),
-            Paint("#1f4d2b", "#86b94e", "#e5d36b", LEAVES, 2.6, 3),
-            throws_shadow=False,
-        ),
-        rectangle(
-            (0, 1.25, 5.0),
-            (16, 8),
-            Paint("#d9b99b", "#8c3f2d", "#efe3cf", TILES, 1.0, 2),
-            turn=FLAT,
-            throws_shadow=False,
-        ),
-        box(
-            (-1.9, 0.35, 6.1), (2.6, 1.8, 0.35), Paint("#b5573f", "#d98d62", "#e8dccb", BRICKS, 2.2)
-        ),
+        wall((0, -1.95, 7.0), (16, 6.5), hedge),
+        wall((0, 1.25, 5.0), (16, 8), floor, turn=FLAT),
+        box((-1.9, 0.35, 6.1), (2.6, 1.8, 0.35), brick),
         box((0.2, 0.8, 4.6), (1.15, 0.9, 0.8), azulejo, turn=(0, 24, 0)),
         ball((0.2, 0.0, 4.6), 0.46, Paint("#2f7a3d", "#9fce5a", "#f0a7c0", LEAVES, 5.0, 8)),
-        rectangle(
-            (1.75, -0.55, 5.4),
-            (1.7, 0.9),
-            Paint("#fff6e0", "#b0273a", text="SHARP\nFIELD"),
-            turn=(0, -14, -4),
-        ),
-        box(
-            (1.75, 0.55, 5.46),
-            (0.09, 1.4, 0.09),
-            Paint("#6b4a2f", "#8f6844", texture=WOOD, cells=4),
-        ),
+        rectangle((1.75, -0.55, 5.4), (1.7, 0.9), sign, turn=(0, -14, -4)),
+        box((1.75, 0.55, 5.46), (0.09, 1.4, 0.09), post),
         ball((1.25, 0.87, 3.6), 0.38, Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=6.0)),
-        box(
-            (-1.15, 0.83, 3.5),
-            (0.72, 0.84, 0.6),
-            Paint("#f2c14e", "#2d4b73", "#f7ead2", STRIPES, 9.0, slant=0.6),
-            turn=(0, -28, 0),
-        ),
+        box((-1.15, 0.83, 3.5), (0.72, 0.84, 0.6), chest, turn=(0, -28, 0)),
         ball((-1.15, 0.16, 3.5), 0.3, Paint("#e9e4f2", "#8a4fb0", "#f6c453", LEAVES, 7.0, 21)),
-        rectangle(
-            (-0.35, -0.95, 4.2),
-            (0.95, 0.62),
-            Paint("#24476b", "#f6e7b4", text="OPEN\n24 h"),
-            turn=(0, 10, 5),
-        ),
+        rectangle((-0.35, -0.95, 4.2), (0.95, 0.62), hours, turn=(0, 10, 5)),
     ]
     return parts, 2.0, 8.0, 0.45
 
@@ -168,8 +143,10 @@ def _shelf() -> Parts:
     """Books, a globe and tins on wooden shelves."""
     back = Paint("#7c5637", "#a97c50", texture=WOOD, cells=1.3)
     wood = Paint("#9a6b41", "#c79a68", texture=WOOD, cells=1.6, seed=4)
+    vase = Paint("#f3ead8", "#2456a6", "#d9822b", TILES, 4.4)
+    tin = Paint("#efe9dc", "#2f6f6a", texture=STRIPES, cells=9)
     parts = [
-        rectangle((0, 0, 5.6), (12, 8), back, throws_shadow=False),
+        wall((0, 0, 5.6), (12, 8), back),
         box((0, 1.42, 5.0), (9, 0.14, 1.2), wood),
         box((0, -0.12, 5.0), (9, 0.14, 1.2), wood),
         box((0, -1.66, 5.0), (9, 0.14, 1.2), wood),
@@ -190,14 +167,10 @@ def _shelf() -> Parts:
         left += width + 0.03
     parts += [
         ball((0.62, -0.72, 4.8), 0.53, Paint("#2f7fb5", "#e9d9a6", "#3f8f4f", MARBLE, 2.4, 5)),
-        box(
-            (1.9, -0.66, 4.9), (0.9, 0.94, 0.5), Paint("#f3ead8", "#2456a6", "#d9822b", TILES, 4.4)
-        ),
+        box((1.9, -0.66, 4.9), (0.9, 0.94, 0.5), vase),
         box((-1.85, 0.87, 4.7), (1.2, 0.96, 0.7), Paint("#fbf3dc", "#1c1c2a", text="TEA\nNo. 7")),
         ball((-0.72, 0.97, 4.55), 0.38, Paint("#f5efe3", "#c8324a", texture=CHECKS, cells=6.5)),
-        box(
-            (0.35, 0.8, 4.7), (0.8, 1.1, 0.6), Paint("#efe9dc", "#2f6f6a", texture=STRIPES, cells=9)
-        ),
+        box((0.35, 0.8, 4.7), (0.8, 1.1, 0.6), tin),
         box((1.6, 0.95, 4.6), (1.15, 0.8, 0.7), Paint("#f4d06f", "#8f2d56", text="PLUM\nJAM")),
         ball((2.0, 0.98, 3.7), 0.3, Paint("#7fb069", "#e6aa68", "#fff1d0", LEAVES, 7.0, 9)),
     ]
@@ -206,22 +179,12 @@ def _shelf() -> Parts:
 
 def _tiles() -> Parts:
     """Three leaning panels in front of a wall: few surfaces, fast to render."""
+    poster = Paint("#fbf6ea", "#1d2b53", text="BLUR\nIS\nDATA")
+    leaves = Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 5.0, 2)
     parts = [
-        rectangle(
-            (0, 0, 6.0),
-            (14, 10),
-            Paint("#e9dcc3", "#2d6a8e", "#d98c3f", TILES, 1.25),
-            throws_shadow=False,
-        ),
-        rectangle(
-            (-0.95, 0.1, 4.0), (1.3, 1.7), Paint("#fbf6ea", "#1d2b53", text="BLUR\nIS\nDATA")
-        ),
-        rectangle(
-            (1.0, -0.15, 3.4),
-            (0.9, 1.2),
-            Paint("#fff3d6", "#b3263a", "#2e7d58", LEAVES, 5.0, 2),
-            turn=(0, -25, 6),
-        ),
+        wall((0, 0, 6.0), (14, 10), Paint("#e9dcc3", "#2d6a8e", "#d98c3f", TILES, 1.25)),
+        rectangle((-0.95, 0.1, 4.0), (1.3, 1.7), poster),
+        rectangle((1.0, -0.15, 3.4), (0.9, 1.2), leaves, turn=(0, -25, 6)),
         ball((0.15, 0.62, 2.9), 0.3, Paint("#f5f0e6", "#2a9d8f", texture=CHECKS, cells=7.0)),
     ]
     return parts, 2.0, 6.5, 0.55
@@ -229,40 +192,17 @@ def _tiles() -> Parts:
 
 def _mobile() -> Parts:
     """Toys that swing in front of a brick wall, each with its own period."""
+    checks = Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5)
+    tiles = Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 3.4)
+    swing = Paint("#24476b", "#f6e7b4", text="SWING")
     parts = [
-        rectangle(
-            (0, 0, 6.0),
-            (14, 10),
-            Paint("#8a4b3a", "#c98e6b", "#e6d9c6", BRICKS, 1.3),
-            throws_shadow=False,
-        ),
-        ball(
-            (-0.8, 0.3, 4.0),
-            0.5,
-            Paint("#f5f0e6", "#d6452b", texture=CHECKS, cells=5),
-            sway=(0.45, 0.1, 0.0, 1.1),
-        ),
-        box(
-            (0.8, -0.2, 4.4),
-            (1.1, 1.1, 0.8),
-            Paint("#f3ead8", "#2456a6", "#e2a33c", TILES, 3.4),
-            turn=(0, 24, 0),
-            sway=(-0.2, 0.35, 0.2, 0.8),
-        ),
-        box(
-            (0.0, 0.95, 3.3),
-            (1.0, 0.4, 0.3),
-            Paint("#24476b", "#f6e7b4", text="SWING"),
-            sway=(0.3, 0.0, 0.2, 1.6),
-        ),
+        wall((0, 0, 6.0), (14, 10), Paint("#8a4b3a", "#c98e6b", "#e6d9c6", BRICKS, 1.3)),
+        ball((-0.8, 0.3, 4.0), 0.5, checks, sway=(0.45, 0.1, 0.0, 1.1)),
+        box((0.8, -0.2, 4.4), (1.1, 1.1, 0.8), tiles, turn=(0, 24, 0), sway=(-0.2, 0.35, 0.2, 0.8)),
+        box((0.0, 0.95, 3.3), (1.0, 0.4, 0.3), swing, sway=(0.3, 0.0, 0.2, 1.6)),
     ]
     return parts, 2.0, 6.5, 0.5
 
 
-SCENES: dict[str, Callable[[], Parts]] = {
-    "garden": _garden,
-    "shelf": _shelf,
-    "tiles": _tiles,
-    "mobile": _mobile,
-}
+SCENES = {"garden": _garden, "shelf": _shelf, "tiles": _tiles, "mobile": _mobile}
 """Scenes by name; all are static but "mobile", whose toys sway."""
