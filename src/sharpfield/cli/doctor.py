@@ -1,6 +1,6 @@
 """`sharpfield doctor`: check a capture before hours of training."""
 
-import json
+import json as json_format
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -42,7 +42,7 @@ def doctor_command(
 
     checkup, held = examine_path(capture, layout=layout)
     about = as_json(checkup)
-    print(_text(about)) if json else _print(checkup)
+    print(json_format.dumps(about, indent=2)) if json else _print(checkup)
     if out is not None:
         write_json(out / FINDINGS, about)
         for number, pixels in enumerate(checkup.images.values()):
@@ -65,10 +65,6 @@ def as_json(checkup: "Checkup") -> dict[str, Any]:
         "findings": [asdict(one) for one in checkup.sorted],
         "images": {f"image_{i}.png": name for i, name in enumerate(checkup.images)},
     }
-
-
-def _text(about: dict[str, Any]) -> str:
-    return json.dumps(about, indent=2)
 
 
 def _print(checkup: "Checkup") -> None:

@@ -64,16 +64,7 @@ class EventStream:
         return self[int(first) : int(last)]
 
     def __getitem__(self, part: slice | Int64[np.ndarray, "k"]) -> "EventStream":
-        """A slice of the stream, as views, or the events of some indices, copied."""
-        return self._taken(part)
-
-    def of_track(self, track: int) -> "EventStream":
-        """The events of one camera, copied; they keep their track."""
-        if self.track is None:
-            return self if track == 0 else self[:0]
-        return self._taken(np.flatnonzero(self.track == track))
-
-    def _taken(self, part: slice | Int64[np.ndarray, "k"]) -> "EventStream":
+        """A slice of the stream, as views; or the events of these numbers, copied."""
         return replace(
             self,
             x=self.x[part],
@@ -82,6 +73,12 @@ class EventStream:
             p=self.p[part],
             track=None if self.track is None else self.track[part],
         )
+
+    def of_track(self, track: int) -> "EventStream":
+        """The events of one camera, copied; they keep their track."""
+        if self.track is None:
+            return self if track == 0 else self[:0]
+        return self[np.flatnonzero(self.track == track)]
 
 
 @dataclass(frozen=True)
@@ -151,17 +148,13 @@ def merged(streams: Sequence[EventStream]) -> EventStream:
         np.zeros(len(events), np.uint16) if events.track is None else events.track
         for events in streams
     ]
-    t_us = np.concatenate([events.t_us for events in streams])
-    order = np.argsort(t_us, kind="stable")
-    return replace(
-        streams[0],
-        x=np.concatenate([events.x for events in streams])[order],
-        y=np.concatenate([events.y for events in streams])[order],
-        t_us=t_us[order],
-        p=np.concatenate([events.p for events in streams])[order],
-        track=np.concatenate(track)[order],
-        tracks=max(events.tracks for events in streams),
-    )
+    columns = {
+        name: np.concatenate([getattr(events, name) for events in streams])
+        for name in ("x", "y", "t_us", "p")
+    }
+    most = max(events.tracks for events in streams)
+    joined = replace(streams[0], track=np.concatenate(track), tracks=most, **columns)
+    return joined[np.argsort(joined.t_us, kind="stable")]
 
 
 def _known_tracks(events: EventStream, where: object) -> None:

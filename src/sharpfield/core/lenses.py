@@ -70,22 +70,8 @@ def lens_in_calibration(name: str) -> Lens | None:
     return next((x for x in LENSES.working().values() if name in x.calibration_names), None)
 
 
-def _pinhole_project(
-    points: Float[Tensor, "*b 3"], coefficients: Coefficients
-) -> Float[Tensor, "*b 2"]:
-    return points[..., :2] / points[..., 2:]
-
-
-def _on_plane_one(
-    plane: Float[Tensor, "*b 2"], coefficients: Coefficients
-) -> Float[Tensor, "*b 3"]:
+def _on_plane_one(plane: Float[Tensor, "*b 2"], _: Coefficients = ()) -> Float[Tensor, "*b 3"]:
     return torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
-
-
-def _brown_project(
-    points: Float[Tensor, "*b 3"], coefficients: Coefficients
-) -> Float[Tensor, "*b 2"]:
-    return distort_brown(points[..., :2] / points[..., 2:], coefficients)
 
 
 def distort_brown(
@@ -129,7 +115,7 @@ def _brown_unproject(
         determinant = xx * yy - xy * xy
         step = torch.stack([yy * wrong_x - xy * wrong_y, xx * wrong_y - xy * wrong_x], -1)
         plane = plane - step / determinant[..., None]
-    return _on_plane_one(plane, coefficients)
+    return _on_plane_one(plane)
 
 
 def _fisheye_project(
@@ -175,7 +161,7 @@ def _fisheye_unproject(
 PINHOLE = Lens(
     "pinhole",
     (),
-    _pinhole_project,
+    lambda points, _: points[..., :2] / points[..., 2:],
     _on_plane_one,
     colmap=(ColmapModel("PINHOLE", 1, TWO_FOCALS), ColmapModel("SIMPLE_PINHOLE", 0, SHARED_FOCAL)),
     nerfstudio="PINHOLE",
@@ -185,7 +171,7 @@ PINHOLE = Lens(
 BROWN = Lens(
     "brown",
     ("k1", "k2", "p1", "p2", "k3"),
-    _brown_project,
+    lambda points, numbers: distort_brown(points[..., :2] / points[..., 2:], numbers),
     _brown_unproject,
     colmap=(
         ColmapModel("OPENCV", 4, (*TWO_FOCALS, "k1", "k2", "p1", "p2")),

@@ -4,9 +4,8 @@ With a rolling shutter each row of a frame opens and closes a little later than 
 the events of each row are shifted in time by that delay, all rows are exposed at the same time, and
 code that compares frames and events of a pixel works as for a global shutter.
 
-The change of log light of a capture, from its events: over an exposure or between two times.
-
-Which colour filter lies before each site of an event camera.
+`EventMotion` is the change of log light of a capture, from its events: over an exposure or between
+two times. `site_channels` says which colour filter lies before each site of an event camera.
 """
 
 from dataclasses import dataclass, replace
@@ -204,12 +203,4 @@ def subtract_row_delay(events: EventStream, row_delay_us: float) -> EventStream:
         return events
     late = np.rint(np.asarray(events.y, np.float64) * row_delay_us).astype(np.int64)
     t_us = np.asarray(events.t_us) - late
-    order = np.argsort(t_us, kind="stable")
-    return replace(
-        events,
-        x=events.x[order],
-        y=events.y[order],
-        t_us=t_us[order],
-        p=events.p[order],
-        track=None if events.track is None else events.track[order],
-    )
+    return replace(events, t_us=t_us)[np.argsort(t_us, kind="stable")]

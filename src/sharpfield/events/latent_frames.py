@@ -58,26 +58,19 @@ class LatentFrames:
         )
         self._log_means: dict[tuple[int, SensorEstimate], Tensor] = {}
 
-    def at(self, time_us: int, sensor_estimate: SensorEstimate) -> Float[Tensor, "h w c"]:
+    def at(self, time_us: int, sensor: SensorEstimate) -> Float[Tensor, "h w c"]:
         """The image at a time, as the frames would store it.
 
         Args:
             time_us: On the clock of the frames.
-            sensor_estimate: Thresholds and clock offset of the events.
+            sensor: Thresholds and clock offset of the events.
         """
-        exposure = self.frames.exposure
-        away = np.maximum(
-            exposure.open_us[self.order] - time_us, time_us - exposure.close_us[self.order]
-        )
-        away = np.maximum(away, 0)
+        opens, closes = self.frames.exposure.open_us, self.frames.exposure.close_us
+        away = np.maximum(opens[self.order] - time_us, time_us - closes[self.order]).clip(0)
         nearest = [int(i) for i in np.argsort(away, kind="stable")[:2]]
         if away[nearest[0]] == 0 or len(nearest) == 1:
-            return self._encode(
-                self._log_light(int(self.order[nearest[0]]), time_us, sensor_estimate)
-            )
-        one, other = (
-            self._log_light(int(self.order[i]), time_us, sensor_estimate) for i in nearest
-        )
+            return self._encode(self._log_light(int(self.order[nearest[0]]), time_us, sensor))
+        one, other = (self._log_light(int(self.order[i]), time_us, sensor) for i in nearest)
         weight = float(away[nearest[1]] / away[nearest].sum())
         return self._encode(weight * one + (1 - weight) * other)
 
@@ -85,41 +78,32 @@ class LatentFrames:
         return self.tone.encode(log_light.exp().clamp(0, 1))
 
     def _log_light(
-        self, frame: int, time_us: int, sensor_estimate: SensorEstimate
+        self, frame: int, time_us: int, sensor: SensorEstimate
     ) -> Float[Tensor, "h w c"]:
         """Log light at a time, from one exposure and the events between its opening and then."""
         opens = int(self.frames.exposure.open_us[frame])
-        first, last = (
-            min(opens, time_us) + sensor_estimate.late_us,
-            max(opens, time_us) + sensor_estimate.late_us,
-        )
+        first, last = (t + sensor.late_us for t in sorted((opens, time_us)))
         negative, positive = counts_between(self.motion, first, last)
         if self.index is not None:
             begin, end = (ramp_at(self.index, t, self.size) for t in (first, last))
             negative = negative + (end - begin)[..., :1]
             positive = positive + (end - begin)[..., 1:]
-        change = negative * sensor_estimate.negative + positive * sensor_estimate.positive
+        change = negative * sensor.negative + positive * sensor.positive
         stored = torch.as_tensor(self.frames.images[frame].astype(np.float32)) / self.frames.white
         blurred = self.tone.decode(stored).clamp_min(FLOOR).log()
-        return (
-            blurred
-            - self._log_mean(frame, sensor_estimate)
-            + (change if time_us >= opens else -change)
-        )
+        return blurred - self._log_mean(frame, sensor) + (change if time_us >= opens else -change)
 
-    def _log_mean(self, frame: int, sensor_estimate: SensorEstimate) -> Float[Tensor, "h w c"]:
+    def _log_mean(self, frame: int, sensor: SensorEstimate) -> Float[Tensor, "h w c"]:
         """Log of the mean of one exposure, relative to its opening; cached for the last one."""
-        if (frame, sensor_estimate) not in self._log_means:
+        if (frame, sensor) not in self._log_means:
             for known in [key for key in self._log_means if key[0] == frame]:
                 del self._log_means[known]
-            opens, closes = (
-                t + sensor_estimate.late_us for t in self.frames.exposure.window(frame)
-            )
+            opens, closes = (t + sensor.late_us for t in self.frames.exposure.window(frame))
             if self.index is not None:
-                thresholds = sensor_estimate.negative, sensor_estimate.positive
+                thresholds = sensor.negative, sensor.positive
                 mean = ramped_log_mean(self.index, (opens, closes), thresholds, self.size)
             else:
-                fixed = FixedThresholds(sensor_estimate.negative, sensor_estimate.positive)
+                fixed = FixedThresholds(sensor.negative, sensor.positive)
                 mean = self.motion.path((opens, closes), np.array([opens]), fixed).log_mean
-            self._log_means[frame, sensor_estimate] = mean.half()
-        return self._log_means[frame, sensor_estimate].float()
+            self._log_means[frame, sensor] = mean.half()
+        return self._log_means[frame, sensor].float()

@@ -66,16 +66,11 @@ def phase_at(
 @no_type_check
 def _phases(offset, t_us, p, time_us, phase, known):
     for site in range(len(phase)):
-        first, low, high = offset[site], offset[site], offset[site + 1]
-        while low < high:
-            middle = (low + high) // 2
-            if t_us[middle] <= time_us:
-                low = middle + 1
-            else:
-                high = middle
+        first, last = offset[site], offset[site + 1]
+        low = first_since(t_us, first, last, time_us + 1)
         if low == first:
             continue
-        if low == offset[site + 1]:
+        if low == last:
             phase[site] = OVERSHOOT * p[low - 1]
             continue
         gap, since, same = t_us[low] - t_us[low - 1], time_us - t_us[low - 1], p[low] == p[low - 1]

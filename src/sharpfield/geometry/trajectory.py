@@ -223,7 +223,34 @@ class BSpline(nn.Module):
         return self.start_us, self.end_us
 
 
-class LearnedKnots(nn.Module):
+class Changed(nn.Module):
+    """A trajectory made from another one, over the same times."""
+
+    base: Trajectory
+
+    def known_us(self, track: int) -> tuple[int, int] | None:
+        """As the base's."""
+        return self.base.known_us(track)
+
+
+class LearnedTwists(Changed):
+    """A trajectory with a cubic B-spline of twists for each track, applied in camera axes."""
+
+    twist: nn.Parameter
+    """[tracks, knots, 6]"""
+
+    def _corrected(
+        self, time: Float[Tensor, "*b"], track: Int64[Tensor, "*b"], u: Float[Tensor, "*b"]
+    ) -> Float[Tensor, "*b 3 4"]:
+        """The base's pose, and then the twist at position u in the spline, counted in segments."""
+        i = u.detach().long().clamp(0, self.twist.shape[1] - 4)
+        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
+        weights = spline.bspline_weights(u - i)
+        twist = (weights[..., None] * self.twist[track[..., None], near]).sum(-2)
+        return se3.compose(self.base.pose(time, track), se3.exp(twist))
+
+
+class LearnedKnots(LearnedTwists):
     """A trajectory with a small learned correction, smooth in time; zero at first.
 
     The correction of a track is a cubic B-spline of twists, applied in camera axes, so that errors
@@ -242,19 +269,10 @@ class LearnedKnots(nn.Module):
     ) -> Float[Tensor, "*b 3 4"]:
         """The base's pose, corrected."""
         segments = self.twist.shape[1] - 3
-        u = time.clamp(0, 1) * segments
-        i = u.detach().long().clamp(0, segments - 1)
-        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
-        weights = spline.bspline_weights(u - i)
-        twist = (weights[..., None] * self.twist[track[..., None], near]).sum(-2)
-        return se3.compose(self.base.pose(time, track), se3.exp(twist))
-
-    def known_us(self, track: int) -> tuple[int, int] | None:
-        """As the base's."""
-        return self.base.known_us(track)
+        return self._corrected(time, track, time.clamp(0, 1) * segments)
 
 
-class Moved(nn.Module):
+class Moved(Changed):
     """A trajectory in another world: scaled, rotated and translated."""
 
     rotation: Float[Tensor, "3 3"]
@@ -276,10 +294,6 @@ class Moved(nn.Module):
         centre = self.change.scale * (turn @ pose[..., 3:]) + shift[:, None]
         return torch.cat([turn @ pose[..., :3], centre], -1)
 
-    def known_us(self, track: int) -> tuple[int, int] | None:
-        """As the base's."""
-        return self.base.known_us(track)
-
 
 def count_tracks(path: Trajectory) -> int:
     """How many tracks a trajectory has."""
@@ -294,7 +308,7 @@ def count_tracks(path: Trajectory) -> int:
             return 1
 
 
-class LearnedExposureMotion(nn.Module):
+class LearnedExposureMotion(LearnedTwists):
     """A trajectory whose tracks are photos, each with a learned motion over its exposure.
 
     The motion is a cubic B-spline of twists in camera axes; outside the exposure the camera is
@@ -336,12 +350,4 @@ class LearnedExposureMotion(nn.Module):
         segments = self.twist.shape[1] - 3
         opens, closes = self.opens[track], self.closes[track]
         u = ((time - opens) / (closes - opens)).clamp(0, 1) * segments
-        i = u.detach().long().clamp(0, segments - 1)
-        near = i[..., None] + torch.arange(4, device=time.device)  # [*b, 4]
-        weights = spline.bspline_weights(u - i)
-        twist = (weights[..., None] * self.twist[track[..., None], near]).sum(-2)
-        return se3.compose(self.base.pose(time, track), se3.exp(twist))
-
-    def known_us(self, track: int) -> tuple[int, int] | None:
-        """As the base's."""
-        return self.base.known_us(track)
+        return self._corrected(time, track, u)

@@ -1,11 +1,8 @@
-"""Starting a run, or going on with one: a recipe trained on a capture, in a folder.
-
-Captures written to disk in the layouts that other programs read.
-"""
+"""Starting a run, or resuming one; captures written in the layouts that other programs read."""
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
@@ -13,6 +10,7 @@ from sharpfield.captures.native.layout import read
 from sharpfield.captures.native.layout import write as write_native
 from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError, RunError, did_you_mean
+from sharpfield.core.events import checked
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
 from sharpfield.runs.config import OWN_CAPTURE, RunConfig, block_of, used, write_run_config
@@ -81,9 +79,6 @@ def train_run(
     return Run(folder, config, built[-1], part)
 
 
-if TYPE_CHECKING:  # names of layouts are read without importing torch
-    from sharpfield.core.capture import Capture
-
 WRITERS: dict[str, str] = {
     "native": "native.layout",
     "ev-deblur-nerf": "writers.llff_events",
@@ -93,7 +88,7 @@ WRITERS: dict[str, str] = {
 """Modules in `sharpfield.captures`, each with a function `write`."""
 
 
-def write(capture: "Capture", folder: Path | str, layout: str = "native") -> None:
+def write(capture: Capture, folder: Path | str, layout: str = "native") -> None:
     """Write a capture; the folder appears whole or not at all. An earlier capture is replaced.
 
     Args:
@@ -120,9 +115,6 @@ def expect_capture(capture: object) -> None:
         ShapeError: A column of its events has another type.
         CaptureError: Its events are not valid.
     """
-    from sharpfield.core.capture import Capture
-    from sharpfield.core.events import checked
-
     if not isinstance(capture, Capture):
         raise OptionError(
             "this is not a capture",

@@ -7,7 +7,6 @@ true blur of every frame (`Frames.blur_px`, see `cameras.motions.travel`). Held-
 instants, and therefore sharp.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -141,9 +140,11 @@ def simulate_room(
     probe = _Probe(place, camera, path, timing.middle_us())
     exposure = _exposure(probe, camera, timing)
     recorded = _Recorded(exposure, rig, seed, events=timing.events)
-    for t_us, rgb, depth in _images(place, camera, path, _times(probe, exposure, timing)):
+    times = _times(probe, exposure, timing).tolist()
+    images = drawn_ahead(lambda t: view(place, camera, path.poses(np.array([t]))[0]), times)
+    for t_us, (rgb, depth) in zip(times, images, strict=True):
         recorded.see(t_us, rgb, depth)
-    frames, events = recorded.frames(), recorded.events()
+    frames = recorded.frames()
     blur = np.array([probe.travel(i, exposure.window(i)).mean() for i in range(len(exposure))])
     if timing.blur == "published":
         ranges = replace(kernels, probability=timing.blurry)
@@ -159,7 +160,7 @@ def simulate_room(
         near=place.near,
         far=place.far,
         frames=replace(frames, blur_px=blur),
-        events=events,
+        events=recorded.events(),
         split=Split(np.flatnonzero(~timing.held_out), np.flatnonzero(timing.held_out)),
         depth=DepthMaps(np.stack(stored), camera),
         name=place.name,
@@ -226,19 +227,6 @@ def _times(probe: _Probe, exposure: Exposure, timing: RoomTiming) -> Int64[np.nd
     if timing.events:
         times.append(np.arange(0, timing.span_us() + 1, timing.step_us))
     return np.unique(np.concatenate(times))
-
-
-Image = tuple[int, Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]
-"""Time, linear light and depth."""
-
-
-def _images(
-    place: Scene, camera: Camera, path: CameraPath, times_us: Int64[np.ndarray, "k"]
-) -> Iterator[Image]:
-    def draw(t_us: int) -> Image:
-        return t_us, *view(place, camera, path.poses(np.array([t_us]))[0])
-
-    yield from drawn_ahead(draw, times_us.tolist())
 
 
 class _Recorded:

@@ -58,6 +58,20 @@ class Motion:
         return replace(self, frequency_hz=factor * self.frequency_hz)
 
 
+@dataclass(frozen=True)
+class Composed:
+    """A path within another: small movements about a base pose, or a path in a drifting world."""
+
+    outer: CameraPath
+    inner: CameraPath
+    """In the axes of the outer one."""
+
+    def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
+        """World-from-camera, OpenCV axes."""
+        outer, inner = (torch.from_numpy(one.poses(t_us)) for one in (self.outer, self.inner))
+        return se3.compose(outer, inner).numpy()
+
+
 def motion(name: str, seed: int) -> Motion:
     """A path by its name, one of `MOTIONS`.
 

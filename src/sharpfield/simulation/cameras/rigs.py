@@ -1,4 +1,4 @@
-"""Camera rigs: a ring of static cameras around the scene, or one hand-held camera.
+"""Camera rigs: a ring of static cameras, one hand-held camera, or a walk through the room.
 
 The ring is that of EvDNeRF's simulated data: cameras at a distance of 4 and an elevation of 30
 degrees look at the origin, in a world whose z axis points up. Held-out cameras are half a step
@@ -6,11 +6,9 @@ between the others.
 
 Source: Bhattacharya et al., *EvDNeRF* (WACV 2024), its poses as published.
 
-A walk through the room: once around the table in 20 s, looking around, with pauses.
-
-The position along the loop is the integral of a speed that is drawn for segments of half a second,
-from standstill to fast. Hand tremor is added, weaker at lower speed. All of it is smooth, and
-depends on a seed.
+The walk goes once around the table in 20 s, looking around, with pauses. The position on that loop
+is the integral of a speed that is drawn for segments of half a second, from standstill to fast.
+Hand tremor is added, weaker at lower speed. All of it is smooth, and depends on a seed.
 """
 
 from collections.abc import Sequence
@@ -23,7 +21,7 @@ from jaxtyping import Float64, Int64
 from sharpfield.core.errors import OptionError
 from sharpfield.core.seed import numpy_generator
 from sharpfield.geometry import se3
-from sharpfield.simulation.cameras.motions import CameraPath, Motion, motion
+from sharpfield.simulation.cameras.motions import CameraPath, Composed, motion
 from sharpfield.simulation.scenes.building import Real
 
 RADIUS, ELEVATION_DEG = 4.0, 30.0
@@ -45,19 +43,6 @@ class StillCamera:
 
 
 @dataclass(frozen=True)
-class CarriedCamera:
-    """A camera that moves around a base pose along a path of small movements."""
-
-    base: Float64[np.ndarray, "3 4"]
-    path: Motion
-
-    def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
-        """World-from-camera: the movement in the axes of the base pose."""
-        base, moved = torch.from_numpy(self.base), torch.from_numpy(self.path.poses(t_us))
-        return se3.compose(base.expand_as(moved), moved).numpy()
-
-
-@dataclass(frozen=True)
 class Views:
     """The cameras of a rig; each is a track of the capture."""
 
@@ -71,13 +56,8 @@ def ring_pose(
 ) -> Float64[np.ndarray, "3 4"]:
     """World-from-camera of a camera that looks at the origin, z up in the image; OpenCV axes."""
     azimuth, elevation = np.deg2rad([azimuth_deg, elevation_deg])
-    outwards = np.array(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    level = np.cos(elevation)
+    outwards = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
     forward = -outwards
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -114,7 +94,7 @@ def hand_held(name: str = "glide", *, seed: int = 0, held_out: int = 0) -> Views
     """
     aside = np.linspace(-20, 20, held_out) if held_out > 1 else np.zeros(held_out)
     return Views(
-        [CarriedCamera(ring_pose(FIRST_DEG), motion(name, seed))],
+        [Composed(StillCamera(ring_pose(FIRST_DEG)), motion(name, seed))],
         [StillCamera(ring_pose(FIRST_DEG + angle)) for angle in aside],
     )
 

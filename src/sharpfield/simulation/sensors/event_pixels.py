@@ -104,18 +104,14 @@ dead time of 500 us; its `noisy` pixels have 0.05, 30 Hz, 0.1 Hz, 5 Hz and 10 ms
 the two in leak and noise, and beside the first in the rest. Assumed: the share of hot pixels.
 """
 
-GEN3_VGA = EventSensor(
-    threshold_on=0.22,
-    threshold_off=0.22,
+GEN3_VGA = replace(
+    DVS346,
     threshold_sigma=0.02,
     refractory_us=100.0,
-    refractory_rule="reset",
     leak_hz=0.05,
-    leak_jitter=0.3,
     shot_hz=0.05,
     hot_share=1e-4,
     cutoff_hz=4000.0,
-    start="random",
 )
 """Prophesee's third generation, 640x480.
 

@@ -16,15 +16,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.errors import OptionError
 from sharpfield.core.frames import ENCODINGS, DepthMaps, Exposure
 from sharpfield.core.seed import numpy_generator
-from sharpfield.geometry import se3
-from sharpfield.simulation.cameras.motions import CameraPath, Motion
+from sharpfield.simulation.cameras.motions import CameraPath, Composed, Motion
 
 
 @dataclass(frozen=True)
@@ -206,22 +204,8 @@ class DepthSensor:
         return near & facing & (change < EDGE * exact)
 
 
-@dataclass(frozen=True)
-class Drifting:
-    """A path as estimated by a SLAM system."""
-
-    path: CameraPath
-    drift: Motion
-    """Of the world."""
-
-    def poses(self, t_us: Int64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 4"]:
-        """World-from-camera, with drift."""
-        drift, path = (torch.from_numpy(one.poses(t_us)) for one in (self.drift, self.path))
-        return se3.compose(drift, path).numpy()
-
-
 def drifting(path: CameraPath, most: float, seed: int) -> CameraPath:
-    """A path that drifts by up to about `most` metres.
+    """A path as a SLAM system estimates it: its world drifts by up to about `most` metres.
 
     Args:
         path: The true one.
@@ -234,4 +218,4 @@ def drifting(path: CameraPath, most: float, seed: int) -> CameraPath:
     size = draw.uniform(0.5, 1, (len(DRIFT_HZ), 6)) * most / len(DRIFT_HZ)
     size[:, 3:] /= ARM_M
     phase = draw.uniform(0, 2 * np.pi, size.shape)
-    return Drifting(path, Motion(np.array(DRIFT_HZ), size, phase))
+    return Composed(Motion(np.array(DRIFT_HZ), size, phase), path)
