@@ -16,7 +16,7 @@ import tyro
 
 from sharpfield import __version__
 from sharpfield.cli import recipe_options
-from sharpfield.core.errors import Hint, OptionError, SharpfieldError, did_you_mean
+from sharpfield.core.errors import Hint, SharpfieldError, expect_one_of
 
 
 @dataclass(frozen=True)
@@ -135,9 +135,8 @@ def _run(words: list[str]) -> None:
         print(usage())
     elif name == "--version":
         print(f"sharpfield {__version__}")
-    elif name not in COMMANDS:
-        raise OptionError("unknown command", got=name, do=did_you_mean(name, COMMANDS))
     else:
+        expect_one_of("command", name, COMMANDS)
         _call(name, options)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from tyro.conf import Positional
@@ -18,6 +18,10 @@ from sharpfield.cli.arguments import Device, screen
 from sharpfield.cli.recipe_options import hint_at_flags
 from sharpfield.core.errors import OptionError
 from sharpfield.training.options import TrainingOptions
+
+if TYPE_CHECKING:
+    from sharpfield.core.capture import Capture
+    from sharpfield.runs.config import RunConfig
 
 
 @dataclass(frozen=True)
@@ -62,24 +66,37 @@ def train_command(
         reading: How to read the capture, where its layout is wrong or silent.
         numbers: Options of the recipe by name, such as sampling.views.
     """
-    from sharpfield.captures.read import read_capture
-    from sharpfield.recipes.settings.options import changed, with_options
-    from sharpfield.recipes.settings.presets import prepared
-    from sharpfield.runs.config import RunConfig, device_named
+    from sharpfield.runs.config import device_named
     from sharpfield.runs.start import train_run
 
-    hint_at_flags(recipe, selection.change)
     console, where = screen(), device_named(device)
-    source = read_capture(capture, reading)
-    made = prepared(recipe, selection.preset, capture=source, device=where)
-    made = with_options(changed(made, selection.change), numbers)
-    where_from = str(capture.resolve())
-    started = RunConfig(
-        recipe, made, where_from, selection.seed, selection.use, reading, selection.block
-    )
+    started, source = _configured(recipe, capture, where, selection, reading, numbers)
     trained = train_run(started, source, out, training, device=where, console=console)
     if trained.status.finished:
         console.print(f"Done. `sharpfield evaluate {out}` measures it.")
+
+
+def _configured(
+    recipe: str,
+    capture: Path,
+    device: str,
+    selection: Selection,
+    reading: ReadOptions,
+    numbers: Mapping[str, Any],
+) -> tuple["RunConfig", "Capture"]:
+    """The run that was asked for, and the capture it is trained on."""
+    from sharpfield.captures.read import read_capture
+    from sharpfield.recipes.settings.options import changed, with_options
+    from sharpfield.recipes.settings.presets import prepared
+    from sharpfield.runs.config import RunConfig
+
+    hint_at_flags(recipe, selection.change)
+    source = read_capture(capture, reading)
+    made = prepared(recipe, selection.preset, capture=source, device=device)
+    made = with_options(changed(made, selection.change), numbers)
+    folder, part = str(capture.resolve()), selection.block
+    config = RunConfig(recipe, made, folder, selection.seed, selection.use, reading, part)
+    return config, source
 
 
 @dataclass(frozen=True)
@@ -119,20 +136,13 @@ def blocks_command(
         reading: How to read the capture, where its layout is wrong or silent.
         numbers: Options of the recipe by name, such as sampling.views.
     """
-    from sharpfield.captures.read import read_capture
-    from sharpfield.recipes.settings.options import changed, with_options
-    from sharpfield.recipes.settings.presets import prepared
     from sharpfield.runs.blocks import BlockRuns, train_blocks
-    from sharpfield.runs.config import RunConfig, device_named
+    from sharpfield.runs.config import device_named
 
     if selection.block:
         raise OptionError("blocks are trained one and all", got=selection.block, do="use `train`")
-    hint_at_flags(recipe, selection.change)
     console, where = screen(), device_named(device)
-    source = read_capture(capture, reading)
-    made = prepared(recipe, selection.preset, capture=source, device=where)
-    made = with_options(changed(made, selection.change), numbers)
-    whole = RunConfig(recipe, made, str(capture.resolve()), selection.seed, selection.use, reading)
+    whole, source = _configured(recipe, capture, where, selection, reading, numbers)
     merged = train_blocks(
         BlockRuns(whole, out, selection.count),
         source,

@@ -13,13 +13,10 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from sharpfield.core.errors import Hint, OptionError, did_you_mean
+from sharpfield.core.errors import Hint, OptionError, did_you_mean, expect_one_of
 from sharpfield.recipes import RECIPES, names_in_source, recipe_named
 from sharpfield.recipes.settings.options import changed, field_texts, new_name, options_of
 from sharpfield.recipes.settings.presets import presets_of
-
-Numbers = dict[str, Any]
-"""Options that were given, by name."""
 
 
 def expect_recipe(words: Sequence[str]) -> None:
@@ -28,8 +25,8 @@ def expect_recipe(words: Sequence[str]) -> None:
     Raises:
         OptionError: It is one.
     """
-    if words and not words[0].startswith("-") and words[0] not in RECIPES:
-        raise OptionError("unknown recipe", got=words[0], do=did_you_mean(words[0], RECIPES))
+    if words and not words[0].startswith("-"):
+        expect_one_of("recipe", words[0], RECIPES)
 
 
 def expect_known(command: Callable[..., None], words: Sequence[str]) -> None:

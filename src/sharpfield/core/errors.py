@@ -11,7 +11,7 @@ Arrays of users: checked against the annotations of what they are given to.
 
 import dataclasses
 import importlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 from types import ModuleType
 from typing import Any, cast
@@ -63,6 +63,16 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     if close := get_close_matches(name, names, n=1, cutoff=0.5):
         return f"did you mean {close[0]}?"
     return f"use one of {', '.join(names)}" if names else "leave it out: there is none"
+
+
+def expect_one_of(kind: str, name: str, known: Collection[str]) -> None:
+    """Make sure that a name is known.
+
+    Raises:
+        OptionError: It is not; `kind` says of what it is the name.
+    """
+    if name not in known:
+        raise OptionError(f"unknown {kind}", got=name, do=did_you_mean(name, known))
 
 
 class MissingExtra(SharpfieldError):

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import expect_one_of
 
 Curve = Callable[[Tensor], Tensor]
 """Light in, something else out; one value at a time, or the channels of one ray at a time."""
@@ -102,6 +102,5 @@ def tone_of(encoding: str) -> Tone:
     Raises:
         OptionError: There is no such encoding.
     """
-    if encoding not in TONES:
-        raise OptionError("unknown tone curve", got=encoding, do=f"use one of {', '.join(TONES)}")
+    expect_one_of("tone curve", encoding, TONES)
     return TONES[encoding]

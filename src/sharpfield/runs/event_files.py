@@ -1,7 +1,6 @@
 """Events of a trained scene written to files: windows of time, event frames, comparisons."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -11,18 +10,11 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.errors import OptionError
 from sharpfield.core.events import EventStream
 from sharpfield.report.event_frames import windows
-from sharpfield.runs.events import event_sensor, whole_steps
+from sharpfield.runs.events import event_sensor, event_viewpoint, whole_steps
 from sharpfield.runs.run import Run
 from sharpfield.simulation.sensors.event_pixels import EventSensor
 from sharpfield.twin.agreement import match_thresholds
-from sharpfield.twin.event_twin import (
-    EventTwin,
-    Viewpoint,
-    light_of,
-    path_viewpoint,
-    resized_camera,
-    track_viewpoint,
-)
+from sharpfield.twin.event_twin import EventTwin, Viewpoint, light_of
 from sharpfield.twin.options import ExtraOptions, PixelOptions, ViewpointOptions
 from sharpfield.twin.options import microseconds as us
 from sharpfield.twin.output import (
@@ -64,8 +56,13 @@ def write_events(
     Raises:
         OptionError: The camera, its time, or the comparison make no sense.
     """
-    whole = _viewpoint(opened, camera, size)
-    viewpoint = whole.between(*_ends(camera))
+    path = camera.view or 0
+    if camera.trajectory is not None:
+        times_us, poses = read_poses(camera.trajectory)
+        path = times_us.tolist(), list(poses)
+    whole = event_viewpoint(opened.model, opened.capture, path, size)
+    start, end = (None if ms is None else us(ms) for ms in (camera.start_ms, camera.end_ms))
+    viewpoint = whole.between(start, end)
     span = _switched_on(whole, viewpoint, camera, extra)
     recorded = _recorded(opened.capture, camera, extra, viewpoint)
     edges = windows(*viewpoint.span_us, us(WINDOW_MS if extra.frames is None else extra.frames))
@@ -110,22 +107,6 @@ def _windows(
     for edge in edges:
         yield twin.until(edge)
         progress(edge)
-
-
-def _viewpoint(opened: Run, camera: ViewpointOptions, size: tuple[int, int] | None) -> Viewpoint:
-    """The camera, as long as the camera's path lasts."""
-    if camera.trajectory is not None:
-        viewpoint = path_viewpoint(opened.model, *read_poses(camera.trajectory))
-    else:
-        viewpoint = track_viewpoint(opened.model, opened.capture, camera.view or 0)
-    if size is None:
-        return viewpoint
-    return replace(viewpoint, camera=resized_camera(viewpoint.camera, size))
-
-
-def _ends(camera: ViewpointOptions) -> tuple[int | None, int | None]:
-    start, end = (None if ms is None else us(ms) for ms in (camera.start_ms, camera.end_ms))
-    return start, end
 
 
 def _switched_on(

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import OptionError, did_you_mean
+from sharpfield.core.errors import expect_one_of
 from sharpfield.core.events import EventStream
 from sharpfield.runs.views import as_pose
 from sharpfield.simulation.sensors.event_pixels import SENSORS, EventSensor
@@ -39,9 +39,7 @@ def event_sensor(capture: Capture, name: str, threshold: float | None = None) ->
     Raises:
         OptionError: There is no sensor of this name.
     """
-    if name not in (RECORDED, *SENSORS):
-        do = did_you_mean(name, [RECORDED, *SENSORS])
-        raise OptionError("unknown sensor", got=name, do=do)
+    expect_one_of("sensor", name, [RECORDED, *SENSORS])
     if name == RECORDED:
         sensor = stated_sensor(capture)
     else:

@@ -9,7 +9,7 @@ from rich.console import Console
 from sharpfield.captures.native.layout import read
 from sharpfield.captures.native.layout import write as write_native
 from sharpfield.core.capture import Capture
-from sharpfield.core.errors import OptionError, RunError, did_you_mean
+from sharpfield.core.errors import OptionError, RunError, expect_one_of
 from sharpfield.core.events import checked
 from sharpfield.core.protocols import Model
 from sharpfield.evaluation.views import validation
@@ -102,8 +102,7 @@ def write(capture: Capture, folder: Path | str, layout: str = "native") -> None:
             has no place for.
     """
     expect_capture(capture)
-    if layout not in WRITERS:
-        raise OptionError("unknown layout to write", got=layout, do=did_you_mean(layout, WRITERS))
+    expect_one_of("layout to write", layout, WRITERS)
     import_module(f"sharpfield.captures.{WRITERS[layout]}").write(capture, Path(folder))
 
 

@@ -4,9 +4,9 @@ Each group of options has a default for every field, and ignores what a kind of 
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
-from sharpfield.core.errors import OptionError, did_you_mean
+from sharpfield.core.errors import OptionError, expect_one_of
 
 if TYPE_CHECKING:  # options are read without importing torch
     from sharpfield.core.capture import Capture
@@ -183,8 +183,8 @@ def simulate_named(
     from sharpfield.simulation.static_capture import Rig, Timing
     from sharpfield.simulation.static_capture import simulate as simulate_still
 
-    _expect_known("scene", scene, [*SCENES, *MOVING_SCENES, ROOM])
-    _expect_known("motion", recording.motion, MOTIONS)
+    expect_one_of("scene", scene, [*SCENES, *MOVING_SCENES, ROOM])
+    expect_one_of("motion", recording.motion, MOTIONS)
     whole = isinstance(size, tuple | list) and all(isinstance(side, int) for side in size)
     if size is not None and not (whole and len(size) == 2 and min(size) >= 8):
         raise OptionError("this is not the size of a sensor", got=size, do=SIZES)
@@ -219,10 +219,5 @@ def sensor_named(name: str) -> "EventSensor":
     """
     from sharpfield.simulation.sensors.event_pixels import SENSORS
 
-    _expect_known("sensor", name, SENSORS)
+    expect_one_of("sensor", name, SENSORS)
     return SENSORS[name]
-
-
-def _expect_known(name: str, value: str, names: Any) -> None:
-    if value not in names:
-        raise OptionError(f"unknown {name}", got=value, do=did_you_mean(value, names))

@@ -2,14 +2,8 @@ import numpy as np
 import pytest
 
 from sharpfield.core.errors import OptionError
-from sharpfield.simulation.cameras.motions import motion
-from sharpfield.simulation.cameras.rigs import (
-    CarriedCamera,
-    StillCamera,
-    hand_held,
-    ring,
-    ring_pose,
-)
+from sharpfield.simulation.cameras.motions import Composed, motion
+from sharpfield.simulation.cameras.rigs import StillCamera, hand_held, ring, ring_pose
 
 PUBLISHED = [  # OpenGL axes: right, up, back
     [0.98481, 0.08682, -0.15038, -0.60153],
@@ -54,7 +48,7 @@ def test_standing_cameras_stand_and_carried_ones_move():
     still = StillCamera(ring_pose(10)).poses(times)
     np.testing.assert_array_equal(still, np.stack([ring_pose(10)] * 3))
     base, path = ring_pose(-90), motion("shaky", 3)
-    poses = CarriedCamera(base, path).poses(times)
+    poses = Composed(StillCamera(base), path).poses(times)
     for pose, own in zip(poses, path.poses(times), strict=True):
         square = [np.concatenate([p, [[0, 0, 0, 1]]]) for p in (base, own)]
         np.testing.assert_allclose(pose, (square[0] @ square[1])[:3], atol=1e-12)

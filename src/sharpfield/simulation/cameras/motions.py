@@ -18,7 +18,7 @@ from jaxtyping import Float32, Float64, Int64
 
 from sharpfield.core.camera import Camera
 from sharpfield.core.capture import Clock
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import expect_one_of
 from sharpfield.core.frames import Exposure
 from sharpfield.core.seed import numpy_generator
 from sharpfield.geometry import se3
@@ -78,8 +78,7 @@ def motion(name: str, seed: int) -> Motion:
     Raises:
         OptionError: There is no such path.
     """
-    if name not in MOTIONS:
-        raise OptionError("unknown motion", got=name, do=f"use one of {', '.join(MOTIONS)}")
+    expect_one_of("motion", name, MOTIONS)
     return MOTIONS[name](seed)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import expect_one_of
 from sharpfield.simulation.scenes.building import (
     Bodies,
     Map,
@@ -53,10 +53,7 @@ def moving_scene(name: str) -> Scene:
     Raises:
         OptionError: There is no such scene.
     """
-    if name not in MOVING_SCENES:
-        raise OptionError(
-            "unknown moving scene", got=name, do=f"use one of {', '.join(MOVING_SCENES)}"
-        )
+    expect_one_of("moving scene", name, MOVING_SCENES)
     parts, maps = MOVING_SCENES[name]()
     surfaces = build([part for _, part in parts], sun=SUN, ambient=0.5, sky=GREY)
     body = np.array([number for number, _ in parts], np.int64)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import expect_one_of
 from sharpfield.simulation.scenes.building import (
     FLAT,
     Bodies,
@@ -104,8 +104,7 @@ def scene(name: str) -> Scene:
     Raises:
         OptionError: There is no such scene.
     """
-    if name not in SCENES:
-        raise OptionError("unknown scene", got=name, do=f"use one of {', '.join(SCENES)}")
+    expect_one_of("scene", name, SCENES)
     parts, near, far, ambient = SCENES[name]()
     return Scene(name, build(parts, ambient=ambient), near, far)
 

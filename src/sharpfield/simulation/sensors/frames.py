@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 from sharpfield.core.camera import Camera
-from sharpfield.core.errors import OptionError
+from sharpfield.core.errors import OptionError, expect_one_of
 from sharpfield.core.frames import ENCODINGS, DepthMaps, Exposure
 from sharpfield.core.seed import numpy_generator
 from sharpfield.simulation.cameras.motions import CameraPath, Composed, Motion
@@ -41,10 +41,7 @@ class FrameSensor:
     """Each row opens and closes this much later than the one above: a rolling shutter."""
 
     def __post_init__(self) -> None:
-        if self.encoding not in ENCODINGS:
-            raise OptionError(
-                "unknown response curve", got=self.encoding, do=f"use one of {', '.join(ENCODINGS)}"
-            )
+        expect_one_of("response curve", self.encoding, ENCODINGS)
         if self.bits not in (8, 16):
             raise OptionError("a stored value has 8 or 16 bits", got=self.bits)
 
