@@ -4,9 +4,7 @@ Everything that comes from outside (files, the command line, a user's arrays) fa
 these; the command line prints the message alone and exits with code 2. Truths internal to the
 program are plain assertions.
 
-Optional packages: imported where they are used, with an error that names the extra.
-
-Arrays of users: checked against the annotations of what they are given to.
+Also here: the import of optional packages, and the check of users' arrays against annotations.
 """
 
 import dataclasses
@@ -30,11 +28,9 @@ class SharpfieldError(Exception):
     def __init__(self, what: str, *, where: object = "", got: object = "", do: str = "") -> None:
         self.what, self.where, self.got, self.do = what, str(where), str(got), do
         lines = [f"{type(self).__name__}: {what}"]
-        lines += [f"  {key:5}  {text}" for key, text in self._details() if text]
+        details = {"where": self.where, "got": self.got, "do": self.do}
+        lines += [f"  {key:5}  {text}" for key, text in details.items() if text]
         super().__init__("\n".join(lines))
-
-    def _details(self) -> list[tuple[str, str]]:
-        return [("where", self.where), ("got", self.got), ("do", self.do)]
 
 
 class CaptureError(SharpfieldError):

@@ -30,7 +30,14 @@ class Struct:
         cls.__repr__ = Struct.__repr__
 
     def __repr__(self) -> str:
-        return one_line(self)
+        """As a dataclass, its tensors by their shapes alone."""
+        shown: list[str] = []
+        for name, value in self._fields():
+            shape: Any = getattr(value, "shape", None)
+            if value is not None:
+                text = repr(value) if shape is None or isinstance(value, Struct) else str([*shape])
+                shown.append(f"{name}={text}")
+        return f"{type(self).__name__}({', '.join(shown)})"
 
     def map(self: S, change: Callable[[Tensor, int], Tensor]) -> S:
         """Apply `change(tensor, trailing axes)` to every tensor, also inside nested structs."""
@@ -65,21 +72,23 @@ class Struct:
             )
         )
 
+    def _first(self) -> tuple[str, Tensor]:
+        """The first tensor, and the name of its field."""
+        for name, value in self._fields():
+            if isinstance(value, Tensor):
+                return name, value
+        raise AssertionError(f"{type(self).__name__} holds no tensor")
+
     @property
     def shape(self) -> torch.Size:
         """The leading axes."""
-        for name, value in self._fields():
-            if isinstance(value, Tensor):
-                return value.shape[: value.ndim - self.trailing.get(name, 0)]
-        raise AssertionError(f"{type(self).__name__} holds no tensor")
+        name, tensor = self._first()
+        return tensor.shape[: tensor.ndim - self.trailing.get(name, 0)]
 
     @property
     def device(self) -> torch.device:
         """Where the tensors are."""
-        for _, value in self._fields():
-            if isinstance(value, Tensor):
-                return value.device
-        raise AssertionError(f"{type(self).__name__} holds no tensor")
+        return self._first()[1].device
 
     def __len__(self) -> int:
         """Size of the first leading axis."""
@@ -100,18 +109,6 @@ class Struct:
     def _fields(self) -> list[tuple[str, Any]]:
         fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
         return [(field.name, getattr(self, field.name)) for field in fields]
-
-
-def one_line(record: Any) -> str:
-    """A dataclass as text, its arrays and tensors by their shapes alone."""
-    shown: list[str] = []
-    for field in dataclasses.fields(record):
-        value: Any = getattr(record, field.name)
-        shape: Any = getattr(value, "shape", None)
-        if value is not None:
-            text = repr(value) if shape is None or isinstance(value, Struct) else str([*shape])
-            shown.append(f"{field.name}={text}")
-    return f"{type(record).__name__}({', '.join(shown)})"
 
 
 def device_of(part: object) -> torch.device:

@@ -7,10 +7,9 @@ Where a gradient is sparse, each row has its own step count: moments and bias co
 are updated only in steps whose gradient has that row, and other rows cost nothing. (Dense Adam
 would keep moving all rows along their momentum.) Dense gradients go to PyTorch's Adam, unchanged.
 
-Points added, pruned and relocated during training: parameters and optimizer state change alike.
-
-Adam's moments follow the rows they belong to. They restart at zero for fresh points and for values
-that differ from their source row. State of a parameter as a whole (its step count) is kept.
+When points are added, pruned or relocated, Adam's moments follow the rows they belong to. They
+restart at zero for fresh points and for values that differ from their source row. State of a
+parameter as a whole (its step count) is kept.
 """
 
 import math
@@ -129,7 +128,10 @@ def apply_growth(part: PointSet, optimizer: Optimizer, growth: Growth) -> None:
     with torch.no_grad():
         copied = {name: rows[growth.source] for name, rows in old.items()}
         new = copied | growth.values
-        restarted = {name: _restarted(copied[name], new[name], growth) for name in old}
+        restarted = {  # values that differ from their source row, and all of fresh points
+            name: (new[name] != rows) | growth.fresh.view(-1, *[1] * (rows.ndim - 1))
+            for name, rows in copied.items()
+        }
     part.replace(new)
     parameters = {name: rows for name, rows in old.items() if isinstance(rows, nn.Parameter)}
     grown = part.points()
@@ -154,12 +156,6 @@ def replace_parameters(optimizer: Optimizer, successors: Mapping[Tensor, Tensor]
     """Replace parameters in the optimizer's groups."""
     for group in optimizer.param_groups:
         group["params"] = [successors.get(old, old) for old in group["params"]]
-
-
-def _restarted(copied: Tensor, new: Tensor, growth: Growth) -> Tensor:
-    """Which values of a parameter restart with moments of zero."""
-    fresh = growth.fresh.view(-1, *[1] * (new.ndim - 1))
-    return (new != copied) | fresh
 
 
 def _moved(value: Tensor, parameter: Tensor, growth: Growth, restarted: Tensor) -> Tensor:
