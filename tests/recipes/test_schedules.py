@@ -65,7 +65,7 @@ def test_terms_of_the_loss(tiny: Capture, variant: Any, wanted: dict[int, set[st
 def test_each_pixel_has_one_ray_before_the_kernel_and_ten_after(tiny: Capture):
     made = model(blender_full, tiny)
     assert not made.frames.blurred(1198) and made.frames.blurred(1199)
-    assert made.frames.blur.expose(made.draw(1199)["frames"]).shape == (4, 10)
+    assert made.frames.blur.kernel.expose(made.draw(1199)["frames"]).shape == (4, 10)
     assert made.heaviest_step == 1199
 
 

@@ -1,21 +1,15 @@
-"""Rigid blurring kernel: blur as a few rigid motions of the camera, learned for each image.
+"""Learned blur kernels for each image: every pixel is the weighted mean of a few moved rays.
 
-Every pixel of an image is the weighted mean of its ray under the same few small rigid motions: the
+*Rigid blurring kernel*: all pixels of an image share a few small rigid motions of the camera. The
 first ray (the *origin*) is unmoved, the motions of the others are twists that a network computes
-from a learned code of the image.
+from a learned code of the image. *Deformable sparse kernel*: each image has a few *canonical*
+points around a pixel. A network displaces them, gives each a weight and shifts the origin of its
+ray a little, depending on the image's learned code and on the position of the pixel in the image;
+so the kernel may vary across the image.
 
 Sources: DP-NeRF (CVPR 2023), section 3.2 (rigid blurring kernel); Ev-DeblurNeRF (CVPR 2024), which
-uses nine motions and the origin. Initial values and the order of the outputs are those of the
-released code.
-
-Deformable sparse kernel: blur as a few displaced rays of each pixel, learned for each image.
-
-Each image has a few *canonical* points around a pixel. A network displaces them, gives each a
-weight and shifts the origin of its ray a little, depending on the image's learned code and on the
-position of the pixel in the image; so the kernel may vary across the image.
-
-Source: Deblur-NeRF (CVPR 2022), section 3.2 (deformable sparse kernel), 3.3 (ray origins) and 3.4
-(alignment).
+uses nine motions and the origin, initial values and order of the outputs from the released code;
+Deblur-NeRF (CVPR 2022), section 3.2 (deformable sparse kernel), 3.3 (ray origins), 3.4 (alignment).
 """
 
 from dataclasses import dataclass
@@ -42,8 +36,6 @@ ORIGIN = 0
 
 HEAD_BOUND = 1e-5
 """First weights of the motion heads, uniform in plus and minus this; see `RigidMotions`."""
-
-Centre = Literal["world", "camera"]
 
 
 class RigidMotions(nn.Module):
@@ -108,7 +100,7 @@ class RigidKernel:
     trajectory: Trajectory
     motions: RigidMotions
     tone: Curve = identity
-    centre: Centre = "world"
+    centre: Literal["world", "camera"] = "world"
     """Centre of the rotations: the origin of the model's world, as released, or the camera, in its
     own axes."""
 

@@ -27,9 +27,6 @@ BITS = 21
 EDGE = 0.1
 """Relative change of depth between neighbours from which on there is an edge and no surface."""
 
-Which = Literal["train", "all"]
-"""Whose depth to fuse: of training frames, or of held-out ones, too."""
-
 
 @dataclass(frozen=True)
 class FusedPoints:
@@ -77,7 +74,7 @@ class _DepthPixels:
 def fuse_points(
     capture: Capture,
     *,
-    frames: Which = "train",
+    frames: Literal["train", "all"] = "train",
     stride: int = 2,
     voxel: float = 0.01,
     min_depth: float = 0.0,

@@ -12,7 +12,7 @@ from sharpfield.core.capture import Capture
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import tone_of
 from sharpfield.events.threshold import FixedThresholds
-from sharpfield.initialisation.fused_points import fuse_points
+from sharpfield.initialisation.fused_points import FusedPoints, fuse_points
 from sharpfield.initialisation.posed_images import sharp_images
 from sharpfield.initialisation.start_points import starting_points
 from sharpfield.storage.disk_cache import cached_arrays
@@ -180,42 +180,28 @@ def colours_seen(
 def _fused(
     options: CloudOptions, capture: Capture, weight: Float[np.ndarray, "a"] | None
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    voxel = options.voxel or _fine_voxel(options, capture)
-
-    def fused(edge: float) -> tuple[np.ndarray, np.ndarray]:
-        assert capture.depth is not None
-        cloud = fuse_points(
+    def fused(voxel: float, stride: int) -> FusedPoints:
+        return fuse_points(
             capture,
             frames=options.frames,
-            stride=1 if capture.depth.camera.width <= 320 else 2,
-            voxel=edge,
+            stride=stride,
+            voxel=voxel,
             min_depth=options.min_depth,
             max_depth=options.max_depth,
             weight=weight,
         )
-        return cloud.points, cloud.colours
 
-    positions, colours = fused(voxel)
+    stride, voxel = 1 if capture.needed_depth.camera.width <= 320 else 2, options.voxel
+    if not voxel:  # a 900th of the edge of a cube a little larger than the scene
+        coarse = (options.max_depth if np.isfinite(options.max_depth) else capture.far) / 50
+        voxel = 1.05 * float(np.ptp(fused(coarse, 8).points, axis=0).max()) / 900
+    cloud = fused(voxel, stride)
     for _ in range(3):  # points on surfaces grow with the square of how fine voxels are
-        if not options.max_points or len(positions) <= 1.1 * options.max_points:
+        if not options.max_points or len(cloud) <= 1.1 * options.max_points:
             break
-        voxel *= (len(positions) / options.max_points) ** 0.5
-        positions, colours = fused(voxel)
-    return positions, colours
-
-
-def _fine_voxel(options: CloudOptions, capture: Capture) -> float:
-    """A 900th of the edge of a cube a little larger than the scene."""
-    coarse = (options.max_depth if np.isfinite(options.max_depth) else capture.far) / 50
-    rough = fuse_points(
-        capture,
-        frames=options.frames,
-        stride=8,
-        voxel=coarse,
-        min_depth=options.min_depth,
-        max_depth=options.max_depth,
-    )
-    return 1.05 * float(np.ptp(rough.points, axis=0).max()) / 900
+        voxel *= (len(cloud) / options.max_points) ** 0.5
+        cloud = fused(voxel, stride)
+    return cloud.points, cloud.colours
 
 
 def _from_images(

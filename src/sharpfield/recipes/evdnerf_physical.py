@@ -232,19 +232,11 @@ class Model(FrameModel):
 
     def groups(self) -> list[Group]:
         """Parameters of voxels, thresholds and clocks with their learning rates."""
-        groups = self.scene.groups(self.lr)
+        groups, until = self.scene.groups(self.lr), self.recipe.lr_decay_steps
         if self.offset is not None:
             rate = self.recipe.windows.offset_lr_us / self.capture.clock.span_us
-            groups.append(
-                Group(
-                    "late",
-                    (self.offset,),
-                    exponential(rate, rate / 20, until=self.recipe.lr_decay_steps),
-                )
-            )
+            groups.append(Group("late", (self.offset,), exponential(rate, rate / 20, until=until)))
         if isinstance(self.thresholds, LearnedThresholds):
             own = tuple(self.thresholds.parameters())
-            groups.append(
-                Group("thresholds", own, exponential(1e-3, 1e-4, until=self.recipe.lr_decay_steps))
-            )
+            groups.append(Group("thresholds", own, exponential(1e-3, 1e-4, until=until)))
         return groups

@@ -43,7 +43,7 @@ def light(rgb: torch.Tensor, weight: torch.Tensor) -> Radiance:
 
 def varied(capture: Capture, learned: LearnedBlur) -> Radiance:
     rgb = torch.rand(PIXELS, RAYS, 3, generator=generator(0, 0, "light"))
-    return light(rgb, learned.expose(pixels()).weight)
+    return light(rgb, learned.kernel.expose(pixels()).weight)
 
 
 def test_trust_golden():
@@ -63,7 +63,7 @@ def test_trust_is_a_staircase_that_never_falls():
 
 def test_one_colour_everywhere_has_the_same_error_under_any_weights(tiny: Capture):
     learned, seen = blur(tiny), pixels()
-    grey = light(torch.full((PIXELS, RAYS, 3), 0.3), learned.expose(seen).weight)
+    grey = light(torch.full((PIXELS, RAYS, 3), 0.3), learned.kernel.expose(seen).weight)
     terms = learned.losses(grey, seen, share=0.25, rigid=True)
     error = (gamma(torch.tensor(0.3)) - seen.value).square().mean()
     torch.testing.assert_close(terms["blur"], 0.75 * 2 * error)  # two stages
@@ -112,7 +112,7 @@ def test_every_parameter_learns(tiny: Capture):
     learned, seen = blur(tiny), pixels()
     for code in learned.motions.parameters():  # those of the frames start at zero
         torch.nn.init.normal_(code, std=0.3, generator=generator(0, 0, "grown"))
-    rays = learned.expose(seen)
+    rays = learned.kernel.expose(seen)
     bright = light(torch.sigmoid(rays.origin + rays.direction), rays.weight)
     terms = learned.losses(bright, seen, share=0.5, rigid=True)
     torch.stack(list(terms.values())).sum().backward()

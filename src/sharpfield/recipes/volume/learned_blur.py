@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import Pixels
-from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.rays import Radiance
 from sharpfield.core.schedule import Schedule
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Curve
@@ -76,10 +76,6 @@ class LearnedBlur(nn.Module):
             if options.adaptive and features
             else None
         )
-
-    def expose(self, seen: Pixels) -> Rays:
-        """The unmoved ray and the moved rays of each pixel."""
-        return self.kernel.expose(seen)
 
     def losses(
         self, light: Radiance, seen: Pixels, *, share: float, rigid: bool

@@ -18,7 +18,7 @@ from sharpfield.fields.mlp import MLPField
 from sharpfield.fields.plane_grid import HeadSize, PlaneField
 from sharpfield.fields.voxels import VoxelField, shapes_in
 from sharpfield.geometry.normalise import normalised, reference_poses
-from sharpfield.geometry.space import EvenDepth, Frustum, Space, forward_facing
+from sharpfield.geometry.space import EvenDepth, Frustum, forward_facing
 from sharpfield.losses.regularizers import smoothness
 from sharpfield.ops.grid import total_variation
 from sharpfield.rendering.coarse_to_fine import CoarseToFine, Compositing
@@ -114,8 +114,18 @@ class Volume(nn.Module):
         self.capture, self.change = normalised(capture)
         self.path = self.capture.trajectory
         poses = reference_poses(self.capture)
-        self.space = _space(options, self.capture, poses)
-        box = self.space.box(_seen_from(self.capture, poses))
+        camera, frames = self.capture.camera, self.capture.frames
+        in_frustum = options.space == "ndc"
+        in_frustum |= options.space == "auto" and forward_facing(poses)
+        self.space = (
+            Frustum(camera)
+            if in_frustum
+            else EvenDepth(camera, self.capture.near, self.capture.far)
+        )
+        seen_from = torch.as_tensor(poses).float()  # the box must hold all that is seen from there
+        if frames is not None:
+            seen_from = self.capture.frame_pose(np.arange(len(frames)))
+        box = self.space.box(seen_from)
         self.field = _field(options, box, self.capture.camera, seed)
         if isinstance(self.field, VoxelField):
             self.train_view = EvenSteps(self.field, self.space, sum(options.samples))
@@ -192,20 +202,6 @@ def _field(
         octaves=options.octaves,
         precision=_precision(options.precision),
     )
-
-
-def _space(options: VolumeOptions, capture: Capture, poses: np.ndarray) -> Space:
-    in_frustum = options.space == "ndc" or (options.space == "auto" and forward_facing(poses))
-    if in_frustum:
-        return Frustum(capture.camera)
-    return EvenDepth(capture.camera, capture.near, capture.far)
-
-
-def _seen_from(capture: Capture, poses: Float[np.ndarray, "n 3 4"]) -> Float[Tensor, "m 3 4"]:
-    """Poses whose views the scene box must hold: those of the frames, or the given ones."""
-    if capture.frames is None:
-        return torch.as_tensor(poses).float()
-    return capture.frame_pose(np.arange(len(capture.frames)))
 
 
 def _precision(name: str) -> torch.dtype:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sharpfield.core.capture import Capture
 from sharpfield.core.measurements import EventPairs, Pixels, Terms
 from sharpfield.core.protocols import Response
-from sharpfield.core.rays import Radiance, Rays
+from sharpfield.core.rays import Radiance
 from sharpfield.core.schedule import Group, Schedule
 from sharpfield.core.seed import generator
 from sharpfield.core.tone import Curve, gamma, tone_of
@@ -194,7 +194,10 @@ class KernelTerm(FrameTerm):
             terms = {"blur": self.stored_error(light[:, 0], seen.value)} if counts else {}
         else:
             light = volume.sharp(
-                self.blur.expose(seen), step, "frames", samples=self.blur.adaptive is not None
+                self.blur.kernel.expose(seen),
+                step,
+                "frames",
+                samples=self.blur.adaptive is not None,
             )
             terms = self.blur.losses(light, seen, share=self.share(iteration), rigid=counts)
         if self.prior is not None:
@@ -303,22 +306,18 @@ class EventTerm(nn.Module):
             half_pixel=options.half_pixel,
         )
         self.coloured = options.colour and events.coloured
-        self.learned = self._learned_response()
+        inputs = "light+polarity" if options.polarity else "light"
+        self.learned: nn.Module | None = None
+        if options.response == "learned":
+            self.learned = LearnedResponse(inputs=inputs)
+        elif options.response == "residual":
+            self.learned = LogResidual(inputs=inputs, generator=generator(seed, 0, "response"))
         fixed = FixedResponse(gamma) if options.response == "gamma" else FixedResponse()
         self.early: Response = fixed
         self.camera, self.path = capture.camera, capture.trajectory
         self.guess = thresholds_of(capture, options.threshold)
         kind = LearnedThresholds if options.learn_threshold else FixedThresholds
         self.thresholds = kind(*self.guess)
-
-    def _learned_response(self) -> nn.Module | None:
-        options = self.options
-        inputs = "light+polarity" if options.polarity else "light"
-        if options.response == "learned":
-            return LearnedResponse(inputs=inputs)
-        if options.response == "residual":
-            return LogResidual(inputs=inputs, generator=generator(self.seed, 0, "response"))
-        return None
 
     def draw(self, step: int, device: torch.device) -> EventPairs:
         """Random pairs of events of a step."""
@@ -337,10 +336,6 @@ class EventTerm(nn.Module):
         late = self.learned is not None and step + 1 >= self.options.response_from
         response = self.learned if late and self.learned is not None else self.early
         return LogContrast(self.camera, self.path, response)
-
-    def expose(self, seen: EventPairs) -> Rays:
-        """Rays at both instants of each pair."""
-        return self.sensor(0).expose(seen)
 
     def error(
         self, predicted: Float[Tensor, "b 1"], seen: EventPairs, step: int
