@@ -10,12 +10,12 @@ import torch
 
 from sharpfield.captures.native.layout import write
 from sharpfield.captures.read import read_capture
-from sharpfield.fields.gaussians.export import import_splats
 from sharpfield.rendering.splat import Splatting, whole
 from sharpfield.rendering.view import render_view
 from sharpfield.runs.run import open_run
 from sharpfield.storage.ply import read_splats
 from tests.cli.command import run
+from tests.fields.gaussians.ply_files import import_splats
 
 SMALL = ("--steps", 4, "--change", "gaussians.cap_max=300")
 

@@ -2,11 +2,12 @@ import numpy as np
 import torch
 
 from sharpfield.core.tone import srgb
-from sharpfield.fields.gaussians.export import export_splats, import_splats, transformed
+from sharpfield.fields.gaussians.export import export_splats, transformed
 from sharpfield.fields.gaussians.static import FLAT, GREY, Gaussians
 from sharpfield.geometry.se3 import rotation_exp
 from sharpfield.geometry.space import Similarity
 from sharpfield.storage.ply import read_splats
+from tests.fields.gaussians.ply_files import import_splats
 from tests.fields.gaussians.test_static import made
 
 EYE = torch.tensor([[0.3, -0.2, -4.0]])

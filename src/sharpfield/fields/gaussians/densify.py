@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from torch import Generator, Tensor, nn
 
 from sharpfield.core.protocols import Growth, unchanged
@@ -118,9 +118,11 @@ def densify_and_prune(
     largest = gaussians.scales.detach().amax(-1)
     keep = gaussians.opacities.detach() >= PRUNE_OPACITY
     keep &= largest <= options.prune_scale * extent
-    doubled = _doubled(
-        mean_grad, keep & (mean_grad >= options.mean_grad), cap_max - int(keep.sum())
-    )
+    candidates = keep & (mean_grad >= options.mean_grad)
+    order = torch.where(candidates, mean_grad, -1.0).argsort(descending=True, stable=True)
+    doubled = torch.zeros_like(candidates)
+    doubled[order[: max(cap_max - int(keep.sum()), 0)]] = True  # those of the largest gradient
+    doubled &= candidates
     if keep.all() and not doubled.any():
         return None
     split = doubled & (largest > options.split_scale * extent)
@@ -141,16 +143,6 @@ def reset_opacity(opacity_logits: Float[Tensor, "n"]) -> Growth:
     most = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
     growth = unchanged(len(opacity_logits), opacity_logits.device)
     return replace(growth, values={"opacity_logits": opacity_logits.detach().clamp_max(most)})
-
-
-def _doubled(
-    mean_grad: Float[Tensor, "n"], candidates: Bool[Tensor, "n"], room: int
-) -> Bool[Tensor, "n"]:
-    """The candidates of the largest gradient, as many as there is room for."""
-    order = torch.where(candidates, mean_grad, -1.0).argsort(descending=True, stable=True)
-    allowed = torch.zeros_like(candidates)
-    allowed[order[: max(room, 0)]] = True
-    return candidates & allowed
 
 
 def _sampled_offsets(

@@ -1,4 +1,4 @@
-"""Gaussians to and from the .ply files of splat viewers.
+"""Gaussians to the .ply files of splat viewers.
 
 Viewers treat the colours of a file as display values, and blend those. Our Gaussians hold stored
 values of the frames, which are display values, or nearly; only where the frames are linear, colours
@@ -18,7 +18,7 @@ from sharpfield.fields.gaussians.static import FLAT, GREY, Gaussians
 from sharpfield.geometry.se3 import quaternion_from_rotation, rotation_from_quaternion
 from sharpfield.geometry.space import Similarity
 from sharpfield.ops.encoding import spherical_harmonics
-from sharpfield.storage.ply import SplatTable, read_splats, write_splats
+from sharpfield.storage.ply import SplatTable, write_splats
 
 DIRECTIONS = 64
 """In which spherical harmonics are evaluated to rotate them; 16 would do."""
@@ -54,22 +54,6 @@ def export_splats(
         comments=comments,
     )
     write_splats(path, table)
-
-
-def import_splats(path: Path) -> Gaussians:
-    """Read Gaussians from a .ply file; their colours are display values.
-
-    Raises:
-        CaptureError: The file is missing or truncated, or does not hold Gaussians.
-    """
-    table = read_splats(path)
-    return Gaussians(
-        torch.from_numpy(table.means),
-        torch.from_numpy(table.quaternions),
-        torch.from_numpy(table.log_scales),
-        torch.from_numpy(table.opacity_logits),
-        torch.from_numpy(table.harmonics),
-    )
 
 
 def transformed(gaussians: Gaussians, change: Similarity) -> Gaussians:
