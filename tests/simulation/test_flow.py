@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from sharpfield.core.camera import Camera
-from sharpfield.simulation.cameras.motions import Motion, motion
-from sharpfield.simulation.cameras.rigs import CarriedCamera, StillCamera, ring_pose
+from sharpfield.simulation.cameras.motions import Composed, Motion, motion
+from sharpfield.simulation.cameras.rigs import StillCamera, ring_pose
 from sharpfield.simulation.moving_capture import depth_and_flow
 from sharpfield.simulation.scenes.moving import MOVING_SCENES, moving_scene
 from sharpfield.simulation.scenes.static import scene
@@ -14,7 +14,7 @@ CAMERA = Camera(64, 64, 89.0, 89.0, 32.0, 32.0)
 RING = StillCamera(ring_pose(-90))
 CASES = {
     **{name: (moving_scene(name), RING) for name in MOVING_SCENES},
-    "carried": (moving_scene("spinner"), CarriedCamera(ring_pose(-70), motion("glide", 1))),
+    "carried": (moving_scene("spinner"), Composed(StillCamera(ring_pose(-70)), motion("glide", 1))),
     "sway": (scene("mobile"), motion("glide", 1)),
 }
 

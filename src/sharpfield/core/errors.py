@@ -56,7 +56,7 @@ class Hint(UserWarning):
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """What to do about an unknown name: the known one most like it, or all if none is."""
     names = list(known)
-    if close := get_close_matches(name, names, n=1, cutoff=0.5):
+    if close := get_close_matches(name, names, n=1, cutoff=0.6):
         return f"did you mean {close[0]}?"
     return f"use one of {', '.join(names)}" if names else "leave it out: there is none"
 
