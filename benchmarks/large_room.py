@@ -40,8 +40,8 @@ SOFTEST = 9
 """Widest blur, in pixels."""
 
 STAGES = {
-    "read": ("sharpfield.cli.runs", "read"),
-    "judge": ("sharpfield.metrics.quality", "quality"),
+    "read": ("sharpfield.captures.read", "read_capture"),
+    "judge": ("sharpfield.metrics.quality", "frame_quality"),
     "fuse": ("sharpfield.initialisation.point_cloud", "fuse_points"),
     "fit": ("sharpfield.training.session", "fit"),
     "step": ("sharpfield.training.loop", "accumulate"),

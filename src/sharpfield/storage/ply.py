@@ -1,18 +1,17 @@
-"""PLY files: one row of numbers for each vertex, with the property names of the header.
+"""PLY files, and 3D Gaussians in the `.ply` layout that splat viewers read.
 
+A file holds one row of numbers for each vertex, with the property names of the header.
 Reading supports `ascii`, `binary_little_endian` and `binary_big_endian`, with the vertices as first
 element and without list properties; what follows (faces) is ignored. Files are written in binary,
 little endian. A *row* is a numpy structure with a field for each property.
 
 Source: Greg Turk, "The PLY polygon file format" (1994).
 
-3D Gaussians in the `.ply` layout that splat viewers read.
-
-Vertices have the position `x y z`, an unused normal `nx ny nz`, spherical harmonics (SH) of degree
-0 `f_dc_0..2`, higher ones `f_rest_*` (all of red, then green, then blue), the logit of the
-`opacity`, the natural log of the scales `scale_0..2` and a quaternion `rot_0..3` (w x y z). The SH
-include the Condon-Shortley phase, so those of odd order m have the opposite sign of ours. The
-colour of degree 0 is 0.5 + 0.282 f_dc.
+Vertices of Gaussians have the position `x y z`, an unused normal `nx ny nz`, spherical harmonics
+(SH) of degree 0 `f_dc_0..2`, higher ones `f_rest_*` (all of red, then green, then blue), the logit
+of the `opacity`, the natural log of the scales `scale_0..2` and a quaternion `rot_0..3` (w x y z).
+The SH include the Condon-Shortley phase, so those of odd order m have the opposite sign of ours.
+The colour of degree 0 is 0.5 + 0.282 f_dc.
 
 Source: released code of "3D Gaussian splatting for real-time radiance field rendering" (SIGGRAPH
 2023), which made this layout.
